@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hilstar.basics.charts import svg, two_digits
+from hilstar.basics import charts
 from hilstar.basics.palette import declarations
 
 DIGITS = 4
@@ -255,7 +255,7 @@ def _number(value: float) -> str:
     if isinstance(value, int):
         return str(value)
     if 0 < size < MIN_PLAIN:
-        return two_digits(value)
+        return charts.two_digits(value)
     return f"{value:.{DIGITS}g}"
 
 
@@ -373,4 +373,4 @@ def picture_of(data: bytes, kind: str, alt: str) -> str:
 
 def drawing_of(figure: Any, alt: str) -> str:
     """A figure of matplotlib's within the page."""
-    return picture_of(svg(figure).encode(), "svg+xml", alt)
+    return picture_of(charts.svg(figure).encode(), "svg+xml", alt)

@@ -2,7 +2,7 @@
 
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
@@ -14,7 +14,7 @@ from hilstar.cli.running import DisplayOptions
 from hilstar.server.console.terminal import print_found, say
 
 if TYPE_CHECKING:
-    from hilstar.instruments.campaign.acceptance import Acceptance
+    from hilstar.instruments.campaign.acceptance_verdicts import CostOfSet
     from hilstar.instruments.campaign.run import Campaign
     from hilstar.instruments.campaign.store import Directory
 
@@ -64,7 +64,12 @@ def accept(options: AcceptOptions, cases: CaseOptions, display: DisplayOptions) 
     acceptance.check()
     processes = cases.processes()
     if options.dry_run:
-        _print_costs(acceptance, processes, options.as_json)
+        costs = [
+            (cost, [clause.capability for clause in checked.clauses_of(cost.case_set.name)])
+            for cost in acceptance.costs(processes)
+        ]
+        of_time = "at most" if acceptance.on_bench else f"on {processes} cores"
+        print_found(options.as_json, *costs_table(costs, of_time))
         return
     make_directory(options.output)
 
@@ -94,26 +99,25 @@ def accept(options: AcceptOptions, cases: CaseOptions, display: DisplayOptions) 
         raise typer.Exit(1)
 
 
-def _print_costs(acceptance: "Acceptance", workers: int, as_json: bool) -> None:
-    """Print how long each set of cases takes, with the clauses that it is for."""
-    costs = list(acceptance.costs(workers))
+def costs_table(
+    costs: "list[tuple[CostOfSet, list[str]]]", of_time: str
+) -> tuple[dict[str, Any], list[str]]:
+    """How long each set of cases takes, with the clauses that it is for: for --json, and as lines.
+    `of_time` says what the sum is of.
+    """
     rows = []
     lines = []
-    for cost in costs:
+    for cost, clauses in costs:
         name = cost.case_set.name
-        clauses = [clause.capability for clause in acceptance.plan.clauses_of(name)]
         rows.append({"set": name, "cases": cost.cases, "s": cost.seconds, "clauses": clauses})
         cases = f"{name:20}{cost.cases:8} cases  {_time_text(cost.seconds):>8}"
         for clause in clauses:
             lines.append(f"{cases:44}  {clause}")
             cases = ""  # once for all clauses
-    total_s = sum(cost.seconds for cost in costs)
-    total = sum(cost.cases for cost in costs)
-    of_time = f" on {workers} cores"
-    if acceptance.on_bench:
-        of_time = " at most"
-    lines.append(f"{'all':20}{total:8} cases  {_time_text(total_s):>8}{of_time}")
-    print_found(as_json, {"sets": rows, "s": total_s}, lines)
+    total_s = sum(cost.seconds for cost, _ in costs)
+    total = sum(cost.cases for cost, _ in costs)
+    lines.append(f"{'all':20}{total:8} cases  {_time_text(total_s):>8} {of_time}")
+    return {"sets": rows, "s": total_s}, lines
 
 
 def _time_text(seconds: float) -> str:

@@ -297,18 +297,20 @@ def run_cases(this: "Campaign", directory: "Directory", opened: "Workers") -> No
 
 
 @contextmanager
-def telling(cases: int) -> Iterator[Callable[[int], None]]:
+def telling(
+    cases: int, clock_s: Callable[[], float] = time.monotonic
+) -> Iterator[Callable[[int], None]]:
     """Progress with the time left: a bar on a terminal, elsewhere a line every ten seconds."""
     if sys.stderr is not None and sys.stderr.isatty():
         with progress("cases", cases) as advance:
             yield advance
         return
     first: tuple[int, float] | None = None
-    last_s = time.monotonic()
+    last_s = clock_s()
 
     def line(done: int) -> None:
         nonlocal first, last_s
-        now_s = time.monotonic()
+        now_s = clock_s()
         first = first or (done, now_s)
         if now_s - last_s >= LINE_S and done > first[0]:
             last_s = now_s

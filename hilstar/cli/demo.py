@@ -3,7 +3,7 @@
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -22,6 +22,8 @@ from hilstar.server.console.run_status import RunSource, RunStatus
 from hilstar.server.console.terminal import progress, report, say
 
 if TYPE_CHECKING:
+    from hilstar.basics.arrays import FloatArray
+    from hilstar.instruments.assess.budget import Axes
     from hilstar.server.bench.frame import Bench
     from hilstar.server.console.listener import PageListener
     from hilstar.server.frame_feed import FrameFeed
@@ -108,7 +110,7 @@ def demo(options: DemoOptions, page: ActingPageOptions) -> None:
     report(result.summary, options.as_json)
     if tracker is not None and caught() is None:
         tracker.report(result.summary.answers, options.as_json)
-        _say_missed(result.summary)
+        say_missed(result.summary.missed_frames, result.summary.frames)
     if not options.as_json:
         typer.echo(
             f"{'pictures':20}{options.output}/frame_*_codes.png (what the monitor gets),"
@@ -119,10 +121,9 @@ def demo(options: DemoOptions, page: ActingPageOptions) -> None:
         raise typer.Exit(1)
 
 
-def _say_missed(summary: "RunSummary") -> None:
+def say_missed(missed: int, frames: int) -> None:
     """Say where the display missed frames that the tracker's budget takes for its own errors."""
-    missed = summary.missed_frames
-    if missed > MAX_MISSED * summary.frames:
+    if missed > MAX_MISSED * frames:
         say(
             f"hilstar: the display missed {missed} frames, and answers that looked while it held a"
             " frame are in no figure; the machine is busy: close other programs, and run it again"
@@ -269,8 +270,6 @@ class TrackerBeside:
         from hilstar.instruments.assess.assessment import AssessSettings, assess_files
         from hilstar.instruments.assess.page import write_page
         from hilstar.instruments.assess.report import lines_of
-        from hilstar.instruments.simulate.tracker_process import ROLL
-        from hilstar.server.answers.judge import TrackerFigures
 
         try:
             assessment = assess_files(self.ledger, None, AssessSettings(display_attitudes=0))
@@ -278,31 +277,14 @@ class TrackerBeside:
             raise MachineError(f"the demo's run gives no budget: {refusal}") from refusal
         write_page(self._page, assessment)
         parts = assessment.found
-        rows = []
-        for k, axis in enumerate("xyz"):
-            bias_arcsec = float(parts.bias_arcsec[k])
-            rows.append(_LoopFigure(f"bias {axis}", BIAS_ARCSEC[k], bias_arcsec))
-        for name, planted_arcsec, axes in (
-            ("field-of-view error", FOV_ARCSEC, parts.fov_arcsec),
-            ("pixel error", PIXEL_ARCSEC, parts.pixel_arcsec),
-        ):
-            rows.append(_LoopFigure(f"{name} across", planted_arcsec, axes.cross))
-            rows.append(_LoopFigure(f"{name} about", ROLL * planted_arcsec, axes.roll))
-        if isinstance(live, TrackerFigures) and live.answers:
-            wrong_percent = 100 * live.wrong / live.answers
-            rows.append(_LoopFigure("wrong answers", 100 * WRONG, wrong_percent, "%"))
+        rows = loop_figures(parts.bias_arcsec, parts.fov_arcsec, parts.pixel_arcsec, live)
         if as_json:
             say(json.dumps({"loop": [row._asdict() for row in rows]}))
             return
-        for what, text in lines_of(assessment):
-            typer.echo(f"{what:24}{text}")
-        typer.echo(f"{'page':24}{self._page}")
-        typer.echo(f"{'':28}{'planted':>10}{'found':>10}")
-        for row in rows:
-            typer.echo(row.line())
+        print_loop([*lines_of(assessment), ("page", str(self._page))], rows)
 
 
-class _LoopFigure(NamedTuple):
+class LoopFigure(NamedTuple):
     """A figure of the demo's tracker: as it was planted, and as its budget has it."""
 
     quantity: str
@@ -316,3 +298,36 @@ class _LoopFigure(NamedTuple):
         if self.found is not None:
             text = f"{self.found:.2f}"
         return f"{self.quantity:28}{self.planted:10.2f}{text:>10} {self.unit}"
+
+
+def print_loop(budget: Iterable[tuple[str, str]], rows: Iterable[LoopFigure]) -> None:
+    """Print the lines of a budget, and what was planted beside what was found."""
+    for what, text in budget:
+        typer.echo(f"{what:24}{text}")
+    typer.echo(f"{'':28}{'planted':>10}{'found':>10}")
+    for row in rows:
+        typer.echo(row.line())
+
+
+def loop_figures(
+    bias_arcsec: "FloatArray", fov_arcsec: "Axes", pixel_arcsec: "Axes", live: object
+) -> list[LoopFigure]:
+    """The parts of a budget beside those that were planted, and the share of wrong answers where
+    `live` are the figures of a run with answers.
+    """
+    from hilstar.instruments.simulate.tracker_process import ROLL
+    from hilstar.server.answers.judge import TrackerFigures
+
+    rows = []
+    for axis, planted_arcsec, axis_arcsec in zip("xyz", BIAS_ARCSEC, bias_arcsec, strict=True):
+        rows.append(LoopFigure(f"bias {axis}", planted_arcsec, float(axis_arcsec)))
+    for name, planted_arcsec, axes in (
+        ("field-of-view error", FOV_ARCSEC, fov_arcsec),
+        ("pixel error", PIXEL_ARCSEC, pixel_arcsec),
+    ):
+        rows.append(LoopFigure(f"{name} across", planted_arcsec, axes.cross))
+        rows.append(LoopFigure(f"{name} about", ROLL * planted_arcsec, axes.roll))
+    if isinstance(live, TrackerFigures) and live.answers:
+        wrong_percent = 100 * live.wrong / live.answers
+        rows.append(LoopFigure("wrong answers", 100 * WRONG, wrong_percent, "%"))
+    return rows

@@ -28,7 +28,7 @@ from hilstar.server.console.terminal import print_json, progress, say
 ORION_DEG = (84.057, -1.2, 0.0)  # RA, Dec and roll where a spin begins
 LISTEN_SLICE_S = 0.1  # between checks for a signal
 USUAL_SPIN_HZ = 100.0
-LINK_COUNTS = ("requests", "statuses", "unsent")  # of the links that answer, or may be full
+LINK_COUNTS = ("requests", "statuses")  # of the links that answer
 
 
 def share_option() -> Any:
@@ -114,7 +114,7 @@ def send(options: SendOptions, pointing: PlaceOptions, statements: LogStatements
         cable = BadCable(faults, rng, link.put)
         say(f"waiting for a listener on {link.endpoint}")
         with progress("waiting", options.wait) as waited:
-            is_heard = heard(link, options.wait, stop, waited)
+            is_heard = heard(link.wait_for_listener, options.wait, stop, waited)
         if not is_heard:
             say("no listener yet; sending anyway")
         with progress("sending", total) as advance:
@@ -195,7 +195,7 @@ def tell(tally: Any, link: Any, as_json: bool) -> None:
         print_json(fields)
         return
     faults = []
-    for name in ("lost", "corrupted", "reordered", "unsent"):
+    for name in ("lost", "corrupted", "reordered"):
         if fields.get(name):
             faults.append(f"{fields[name]} {name}")
     line = f"{fields['sent']} packets sent"
@@ -206,7 +206,12 @@ def tell(tally: Any, link: Any, as_json: bool) -> None:
         say(f"{fields['statuses']} statuses heard, {fields['requests']} time requests answered")
 
 
-def heard(sender: Any, wait_s: float, stop: threading.Event, waited: Callable[[int], None]) -> bool:
+def heard(
+    wait_for_listener: Callable[[float], bool],
+    wait_s: float,
+    stop: threading.Event,
+    waited: Callable[[int], None],
+) -> bool:
     """Whether a receiver listens within `wait_s`; True, too, once the sender is stopped, which then
     ends at once.
     """
@@ -214,7 +219,7 @@ def heard(sender: Any, wait_s: float, stop: threading.Event, waited: Callable[[i
     deadline_s = started_s + wait_s
     while not stop.is_set():
         waited(round(time.monotonic() - started_s))
-        if sender.wait_for_listener(min(LISTEN_SLICE_S, max(0.0, deadline_s - time.monotonic()))):
+        if wait_for_listener(min(LISTEN_SLICE_S, max(0.0, deadline_s - time.monotonic()))):
             return True
         if time.monotonic() >= deadline_s:
             return False

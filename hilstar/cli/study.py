@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Iterable
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import check_directory, make_directory
@@ -50,6 +50,7 @@ TIMED = {
     "faults",
     "colour",
 }
+WHOLE = {"models", "outputs", "stability"}  # the studies of which no part is quick
 CHAIN_SCENES = 5
 
 
@@ -181,18 +182,22 @@ def study_lines(what: str, output: Path, quick: bool = False) -> tuple[list[str]
     module = what
     if what in ROOMS:
         module = f"{what}.run"
-    study_of = import_module(f"hilstar.instruments.study.{module}")
+    run = import_module(f"hilstar.instruments.study.{module}").run
+    if what in WHOLE:
+        return findings_of(what, run(output))
+    return findings_of(what, run(output, quick))
+
+
+def findings_of(what: str, result: Any) -> tuple[list[str], bool | None]:
+    """The findings of a study and whether all was right, by what its `run` returns."""
     if what in TIMED:
-        lines, right = study_of.run(output, quick)
+        lines, right = result
         return lines, right
     if what == "models":
-        return [f"{finding.figure}: {finding.text}" for finding in study_of.run(output)], True
+        return [f"{finding.figure}: {finding.text}" for finding in result], True
     if what == "stability":
-        cases = study_of.run(output)
-        return [_case_line(case) for case in cases], all(case.right for case in cases)
-    if what == "outputs":
-        return study_of.run(output), True
-    return study_of.run(output, quick), True
+        return [_case_line(case) for case in result], all(case.right for case in result)
+    return result, True
 
 
 def _case_line(case: "FailureCase") -> str:

@@ -31,9 +31,8 @@ from hilstar.server.console.terminal import print_json, say
 if TYPE_CHECKING:
     import numpy as np
 
-    from hilstar.attitude.wire.shown_frames import FrameWatch
     from hilstar.instruments.simulate.answer_link import AnswerLink
-    from hilstar.instruments.simulate.live_exposure import LiveTracker, Solve
+    from hilstar.instruments.simulate.live_exposure import LiveTracker, Solve, WatchedFrames
     from hilstar.instruments.simulate.tracker_process import Planted
     from hilstar.server.answers.answer import Answer
     from hilstar.server.bench.bench_file import BenchFile
@@ -170,7 +169,7 @@ def tracker(options: TrackerOptions) -> None:
             row(answered)
 
         process.run(None if link is None else send, stop, seconds)
-        summary = process.tally.summary() | counts_of(live, frames, link, gige)
+        summary = process.tally.summary() | counts_of(live.frames, frames.refused, link, gige)
     tell(summary, options.as_json)
 
 
@@ -196,17 +195,17 @@ def planted_errors(options: TrackerOptions) -> "Planted":
 
 
 def counts_of(
-    live: "LiveTracker",
-    frames: "FrameWatch",
+    frames: "WatchedFrames",
+    refused: int,
     link: "AnswerLink | None",
     gige: "GigECamera | None",
 ) -> dict[str, Any]:
-    """What came and what was sent, as `--json` has it."""
+    """What came, what of it was refused, and what was sent, as `--json` has it."""
     counts: dict[str, Any] = {
         "frames": {
-            "received": live.frames.received,
-            "missing": live.frames.missing,
-            "refused": frames.refused,
+            "received": frames.received,
+            "missing": frames.missing,
+            "refused": refused,
         }
     }
     if link is not None:

@@ -27,6 +27,7 @@ from tests.support.commands import run_started
 from tests.support.forks import Started
 from tests.support.readme import plain_pytest
 from tests.support.senders import free_port
+from tests.support.servers import until_said
 from tests.support.waiting import wait_for
 
 DOCS = sorted((ROOT / "docs").glob("*.md"))
@@ -43,8 +44,11 @@ LANGUAGES = {"console", "python", "toml", "json", "text", "c"}
 # of the attitude, a run's frames, a tracker's answers, and the operator's page
 DEFAULT_PORTS = ("5560", "5570", "5580", "8765")
 LISTEN = "0A"  # a state of /proc/net/tcp
-# Of a live run whose figures vary: a minute and a half has the same lines, and holds a worker up.
-MAX_DURATION_S = 25
+# Of a live run whose figures vary: ten seconds have the same lines, and hold a worker up.
+MAX_DURATION_S = 3.0
+# Of one whose ledger is assessed: 80 frames, of which 30 have to be answered.
+MAX_ASSESSED_S = 8.0
+TRACKER_LISTENS = "waiting for frames"
 
 Ports = dict[str, str]
 
@@ -141,7 +145,8 @@ def type_in(block: Block, ports: Ports) -> None:
                 words.append(f"127.0.0.1:{ports['8765']}")
             if block.figures_vary and "--duration" in words:
                 at = words.index("--duration") + 1
-                words[at] = str(min(float(words[at]), MAX_DURATION_S))
+                longest_s = MAX_ASSESSED_S if "--ledger" in words else MAX_DURATION_S
+                words[at] = str(min(float(words[at]), longest_s))
             # each worker is a process, which takes a second to start
             if words[:2] in (["hilstar", "campaign"], ["hilstar", "accept"]):
                 words += ["--workers", "1"]
@@ -176,10 +181,17 @@ def other_program(words: list[str]) -> str:
 
 @contextlib.contextmanager
 def running(words: list[str]) -> Iterator[None]:
-    """A hilstar command, or a script of the page's, beside the others until the block is done."""
+    """A hilstar command, or a script of the page's, beside the others until the block is done; a
+    tracker, which imports its solver first, from when it sees frames.
+    """
     command = words[1:] if words[0] == "python" else ["-m", *words]
-    with Started([sys.executable, *command], stdout=subprocess.DEVNULL) as process:
+    is_tracker = words[:2] == ["hilstar", "tracker"]
+    err = subprocess.PIPE if is_tracker else None
+    streams = {"stdout": subprocess.DEVNULL, "stderr": err}
+    with Started([sys.executable, *command], text=True, **streams) as process:
         try:
+            if is_tracker:
+                until_said(process, TRACKER_LISTENS)
             yield
         finally:
             process.send_signal(signal.SIGTERM)

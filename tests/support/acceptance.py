@@ -48,8 +48,11 @@ def write_bench(folder: Path, **tables: Any) -> Path:
 
 
 def accepted(folder: Path, plan: str, quick: bool = False) -> dict[str, ClauseVerdict]:
-    """The verdict of each clause of a plan's text, by its quantity, and axis where it has one."""
-    bench = write_bench(folder)
+    """The verdict of each clause of a plan's text, by its quantity, and axis where it has one.
+
+    The sky ends where the small tracker finds no star.
+    """
+    bench = write_bench(folder, sky={"faintest_v_mag": 7.0})
     path = folder / "plan.toml"
     path.write_text(plan)
     checked = read_acceptance_plan(path, bench, quick, None)

@@ -159,7 +159,9 @@ def main() -> None:
             if stars is not None:
                 told["centroids"] = reported_stars(planted, stars, found[1], rng)
         line.sendto(json.dumps(told).encode(), ("127.0.0.1", planted.port))
-        k = max(k, int((time.monotonic_ns() - begun_ns) / 1e9 * planted.answer_hz))
+        # exposures that are under way have their answers, too; those that were missed have none
+        behind_s = (time.monotonic_ns() - begun_ns) / 1e9 - planted.latency_s
+        k = max(k, int(behind_s * planted.answer_hz))
     print(json.dumps(wild))
 
 

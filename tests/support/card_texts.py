@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
-from hilstar.basics import charts, pages
+from hilstar.basics import charts
 
 CELL = " | "
 LINE_ENDS = frozenset({"tr", "p", "li", "summary", "h1", "h2", "strong", "small", "div"})
@@ -78,7 +78,7 @@ def drawn_figures() -> Iterator[list[Figure]]:
         return "<svg/>"
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pages, "svg", kept)
+        patch.setattr(charts, "svg", kept)
         patch.setattr(charts, "save", kept)
         patch.setattr(charts, "finish", lambda figure: None)
         yield drawn

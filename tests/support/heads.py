@@ -13,12 +13,13 @@ MOUNTINGS = {
 }
 
 
-def heads_file(folder: Path, port: int, *changes: Tables) -> Path:
-    """A file with three heads that listen to one port of this machine."""
-    for name, q in MOUNTINGS.items():
+def heads_file(folder: Path, port: int, *changes: Tables, names: str = "abc") -> Path:
+    """A file with heads of these names that listen to one port of this machine."""
+    for name in names:
+        q = MOUNTINGS[name]
         own: Tables = {"tracker": {"q_body_to_cam": list(q)}, "render": {"quantisation": "round"}}
         (folder / f"{name}.toml").write_text(bench_text(own, *changes))
     path = folder / "heads.toml"
-    names = ", ".join(f'"{name}.toml"' for name in MOUNTINGS)
-    path.write_text(f'heads = [{names}]\n[attitude]\nendpoint = "tcp://127.0.0.1:{port}"\n')
+    benches = ", ".join(f'"{name}.toml"' for name in names)
+    path.write_text(f'heads = [{benches}]\n[attitude]\nendpoint = "tcp://127.0.0.1:{port}"\n')
     return path

@@ -11,7 +11,6 @@ from __future__ import annotations
 import functools
 import math
 import socketserver
-import sys
 import threading
 import zlib
 from collections.abc import Iterator
@@ -73,7 +72,7 @@ def take(words: list[str]) -> None:
 class _Request(socketserver.StreamRequestHandler):
     def handle(self) -> None:
         try:
-            take(self.rfile.readline().decode().rstrip("\n").split("\0"))
+            take(self.rfile.readline().decode().removesuffix("\0\n").split("\0"))
         except Exception as error:
             self.wfile.write(repr(error).encode())
         else:
@@ -89,10 +88,7 @@ def on_duty() -> Iterator[str]:
         thread = threading.Thread(target=server.serve_forever, args=(0.01,))
         thread.start()
         try:
-            yield (
-                f"{sys.executable} -S -E {Path(__file__).with_name('snapshot.py')}"
-                f" {server.server_address[1]}"
-            )
+            yield f"bash {Path(__file__).with_name('snapshot.sh')} {server.server_address[1]}"
         finally:
             server.shutdown()
             thread.join()

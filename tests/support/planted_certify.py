@@ -241,8 +241,7 @@ def coverage(
         for name in ("reference_stars", "of_sky"):
             patch.setattr(assembly, name, _once(getattr(assembly, name)))
         patch.setattr(certificate, "QUICK_TRIALS", BATCH)
-        # A certificate takes its first check, which is in no figure of it.
-        patch.setattr(certificate, "take_check", lambda file, reader: None)
+        without_check(patch)
         patch.setattr(structure, "_diagonal_in_time", _for_each(structure._diagonal_in_time))
         if LIGHT not in parts:
             patch.setattr(assembly, "light_deviation", _once(assembly.light_deviation))
@@ -259,6 +258,11 @@ def coverage(
             if after is not None:
                 after(number + 1, found)
     return dict(found)
+
+
+def without_check(patch: pytest.MonkeyPatch) -> None:
+    """A certificate takes its first check, which is in no figure of it: here it does not."""
+    patch.setattr(certificate, "take_check", lambda file, reader: None)
 
 
 def _for_each(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -298,6 +302,7 @@ def coverage_by_images(
     """
     found: dict[tuple[str, str], Counted] = defaultdict(Counted)
     with pytest.MonkeyPatch.context() as patch:
+        without_check(patch)
         stars = None
         for number in range(benches):
             with TemporaryDirectory() as name:

@@ -99,7 +99,7 @@ sender = zmq.Context().socket(zmq.PUB)
 sender.setsockopt(zmq.LINGER, 0)
 sender.connect("tcp://127.0.0.1:PORT")
 time.sleep(0.5)
-end = time.monotonic() + 2
+end = time.monotonic() + 1.2
 k = 0
 while time.monotonic() < end:
     body = packet(k, time.monotonic_ns())
@@ -117,7 +117,7 @@ while time.monotonic() < end:
             == 0
         )
         summary = served.summary()
-    assert summary["link"]["flooded"] > 5_000
+    assert summary["link"]["flooded"] > 3_000
     assert 1 <= summary["events"]["flood"] <= 3
     assert (
         0 < summary["packets"]["received"] < MAX_BURST + MAX_PACKETS_PER_S * summary["duration_s"]

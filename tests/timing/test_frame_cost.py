@@ -29,7 +29,7 @@ def test_turns_of_any_rate_are_drawn_in_bounded_time_and_counted(tmp_path):
     turns = [
         ((0.5, 0.5, -0.5, 0.5), (0.6 * r, -0.7 * r, 0.2 * r))
         for r in RATES_RAD_S
-        for _ in range(40)
+        for _ in range(20)
     ]
     attitude = f"max_rate_deg_s = 1e6\n{MOVING}"
     with (
@@ -42,8 +42,8 @@ def test_turns_of_any_rate_are_drawn_in_bounded_time_and_counted(tmp_path):
         process.has_received(len(turns))
         process.send_signal(signal.SIGINT)
         summary = summary_of(process)
-    assert summary["packets"]["accepted"] == 40 * len(RATES_RAD_S)
-    assert summary["capped"] + missed_in(waited.s) > 30, summary
+    assert summary["packets"]["accepted"] == 20 * len(RATES_RAD_S)
+    assert summary["capped"] + missed_in(waited.s) > 15, summary
     assert summary["events"]["capped"] == 1
     assert summary["frame_ms"]["max"] < MAX_FRAME_MS + 1000 * waited.s, (summary, waited.s)
 
@@ -52,13 +52,13 @@ def test_a_rate_in_deg_s_is_refused_by_name_once_said_and_the_stream_goes_on(tmp
     with publisher() as (sender, port), serving(tmp_path, port, attitude=MOVING) as process:
         still = (0.5, 0.5, -0.5, 0.5)
         send_attitudes(
-            sender, [(still, (0.0, 0.0, 57.0 if k % 2 else 1.0)) for k in range(100)], 100
+            sender, [(still, (0.0, 0.0, 57.0 if k % 2 else 1.0)) for k in range(50)], 100
         )
-        process.has_received(100)
+        process.has_received(50)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=PATIENCE_S)
     packets = json.loads(out)["packets"]
-    assert (packets["accepted"], packets["refused_by"]["rate"]) == (50, 50)
+    assert (packets["accepted"], packets["refused_by"]["rate"]) == (25, 25)
     lines = [line for line in err.splitlines() if "max_rate_deg_s" in line]
     assert len(lines) == 1
     assert "send rates in rad/s" in lines[0]
@@ -66,7 +66,7 @@ def test_a_rate_in_deg_s_is_refused_by_name_once_said_and_the_stream_goes_on(tmp
 
 @pytest.mark.parametrize("degrees", [20.0, 90.0, 180.0])
 def test_a_sender_without_rates_that_retargets_stops_no_frame(tmp_path, degrees):
-    """200 Hz, at rest, `degrees` further every 0.1 s, and never a discontinuity: each frame
+    """Half a second at 200 Hz, at rest, `degrees` further every 0.1 s, and never a discontinuity: each frame
     shows one place or the other.
     """
     with (
@@ -74,7 +74,7 @@ def test_a_sender_without_rates_that_retargets_stops_no_frame(tmp_path, degrees)
         serving(tmp_path, port, attitude=MOVING) as process,
         CoreWaits(process.pid) as waited,
     ):
-        send_attitudes(sender, [(turned_q(degrees * (k // 20 % 2)), None) for k in range(200)], 200)
+        send_attitudes(sender, [(turned_q(degrees * (k // 20 % 2)), None) for k in range(100)], 200)
         process.send_signal(signal.SIGTERM)
         asked_s = time.monotonic()
         summary = summary_of(process)

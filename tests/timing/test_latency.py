@@ -27,10 +27,10 @@ from tests.support.x11.screens import Screen, xvfb
 
 # The watcher looks every 0.2 ms or so, and sleeps between; a shared machine may keep it from that
 # now and then.
-MIN_EDGES, MAX_UNMATCHED = 60, 0.05  # share of the edges
+MIN_EDGES, MAX_UNMATCHED = 40, 0.05  # share of the edges
 MEDIAN_MS = 2.0
 ADDED_MS = 40.0
-WATCHED_S = 3  # some 90 edges of the code
+WATCHED_S = 2  # some 60 edges of the code
 DEVICE_MS = 0.5  # of the same edges, a few more or less
 PERIOD_NS = 1e9 / 60
 STEADY_NS = 1e6  # by which the pairing takes latencies together
@@ -90,7 +90,7 @@ def measured_latency(
         Diode(screen, cable.sender, added_ms, device_clock),
     ):
         diode = ["--diode", f"serial:{cable.host}@921600", "--duration", str(WATCHED_S)]
-        output = ["--json", "--save", folder / "edges.csv", "--overwrite", "-o", folder / "charts"]
+        output = ["--json", "--save", folder / "edges.csv", "--overwrite"]
         with real_time():
             result = run_hilstar("latency", folder / "run.mcap", *diode, *output, *options)
     assert result.returncode == 0, result.stderr
@@ -122,7 +122,8 @@ def test_a_delay_that_was_added_is_found_and_written_into_the_bench_file(screen,
     # Its line keeps this diode from looking for so long: not every edge is seen, and those that
     # are, are as late as this.
     late, bench = measured_latency(
-        screen, tmp_path, "code", ADDED_MS, False, "--write", tmp_path / "bench.toml"
+        *(screen, tmp_path, "code", ADDED_MS, False),
+        *("--write", tmp_path / "bench.toml", "-o", tmp_path / "charts"),
     )
     added_ms = late["latency_ms"]["p50"] - plain["latency_ms"]["p50"]
     in_time(abs(added_ms - ADDED_MS) < MEDIAN_MS, (plain, late))
@@ -148,7 +149,7 @@ def test_a_delay_that_was_added_is_found_and_written_into_the_bench_file(screen,
 def test_a_square_that_toggles_is_known_but_for_pairs_of_frames_and_a_device_s_own_clock_is_followed(
     screen, tmp_path
 ):
-    found, _ = measured_undisturbed(screen, tmp_path, "toggle", 0.0, True, edges=100)
+    found, _ = measured_undisturbed(screen, tmp_path, "toggle", 0.0, True, edges=70)
     run = read_run(tmp_path / "run.mcap")
     steady = np.abs(np.diff([frame.swap_ns for frame in run.frames]) - PERIOD_NS) < STEADY_NS
     # A busy machine swaps at uneven times, and they tell one pair of frames from the next as a code

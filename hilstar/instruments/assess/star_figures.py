@@ -350,7 +350,11 @@ def half_seen(v_mag: FloatArray, seen: IntArray, lit: IntArray) -> float:
     half_bin_mag = LIMIT_BIN_MAG / 2
     edges = np.concatenate([v_mag - half_bin_mag, [faintest_mag + half_bin_mag]])
     start = np.array([edges[cut], math.log(0.1)])
-    fitted = optimize.minimize(loss, start, method="Nelder-Mead", options={"xatol": 1e-3})
+    # Unbounded, the logarithm of a sharp curve's width runs away, in thrice as many steps.
+    bounds = ((None, None), (math.log(MIN_SLOPE_MAG / 100), None))
+    fitted = optimize.minimize(
+        loss, start, method="Nelder-Mead", bounds=bounds, options={"xatol": 1e-3}
+    )
     half_mag = max(fitted.x[0], v_mag[0])
     return float(min(half_mag, faintest_mag))
 

@@ -14,7 +14,6 @@ from hilstar.display.calibration import load_calibration
 from hilstar.display.response import Response
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.cameras import bench_camera, tracker_camera
 from hilstar.server.bench.monitor import calibration_source, orientation_of
 
@@ -89,15 +88,6 @@ def in_true_image(
     its = truth.config.monitor
     on_screen = orientation_of(mine).to_screen(x_px, y_px, mine.resolution_px)
     return orientation_of(its).to_image(*on_screen, its.resolution_px)
-
-
-def white_of(file: BenchFile) -> float:
-    """The light of white of a bench file, e-/s."""
-    white = file.config.render.flux_at_white_e_per_s
-    if white is not None:
-        return white
-    with open_bench(file) as bench:
-        return bench.flux_at_white_e_per_s
 
 
 def grey_response(file: BenchFile) -> Response:

@@ -33,7 +33,6 @@ from hilstar.instruments.certify.bench_readings import (
     LightReadings,
     geometry_of,
     grey_response,
-    white_of,
 )
 from hilstar.instruments.certify.effects import smooth_root
 from hilstar.instruments.certify.structure import (
@@ -45,6 +44,7 @@ from hilstar.instruments.certify.structure import (
 )
 from hilstar.optics.camera import field_terms
 from hilstar.server.bench.bench_file import BenchFile
+from hilstar.server.bench.build import full_scale_e_per_s
 from hilstar.server.bench.monitor import bench_calibration
 
 EVEN_DEGREES = (4, 6, 8, 10)
@@ -177,7 +177,7 @@ def light_deviation(file: BenchFile, read: LightReadings) -> LightDeviation:
         )
     response = grey_response(file).light[fit.codes[1:]]
     square_px = _square(file, read)
-    expected = white_of(file) * _evenness_in(file, square_px) * response
+    expected = full_scale_e_per_s(file) * _evenness_in(file, square_px) * response
     relative = 1 / expected[:, None]
     common = fit.means(read.common)[1:]
     return LightDeviation(

@@ -22,11 +22,10 @@ from hilstar.instruments.certify.bench_readings import (
     geometry_of,
     grey_response,
     in_true_image,
-    white_of,
 )
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import open_bench
+from hilstar.server.bench.build import full_scale_e_per_s, open_bench
 from hilstar.server.bench.frame import Bench, Frame
 from hilstar.server.bench.monitor import bench_calibration
 
@@ -298,7 +297,7 @@ def true_deviations(figures: Figures, truth: BenchFile) -> Deviations:
     stated = grey_response(file).light[1:]
     ratio = grey_response(truth).light[1:] / stated
     levels = np.interp(figures.log_light, np.log(stated), ratio)
-    levels *= white_of(truth) / white_of(file)
+    levels *= full_scale_e_per_s(truth) / full_scale_e_per_s(file)
     here_px = figures.x_px, figures.y_px
     true_px = in_true_image(file, truth, *here_px)
     even = np.log(_evenness_at(truth, *true_px) / _evenness_at(file, *here_px))

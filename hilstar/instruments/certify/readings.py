@@ -38,10 +38,10 @@ from hilstar.instruments.certify.bench_readings import (
     geometry_of,
     grey_response,
     in_true_image,
-    white_of,
 )
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.server.bench.bench_file import BenchFile
+from hilstar.server.bench.build import full_scale_e_per_s
 from hilstar.server.bench.cameras import tracker_psf
 from hilstar.server.bench.monitor import bench_calibration
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
@@ -128,7 +128,7 @@ class VirtualReader:
         self._uniformity = bench_calibration(truth.config, truth.folder).uniformity_map(
             monitor.resolution_px
         )
-        self._white_e_per_s = white_of(truth)
+        self._white_e_per_s = full_scale_e_per_s(truth)
 
     def now_ns(self) -> int:
         """The simulated clock."""

@@ -93,6 +93,17 @@ def open_bench(
     return assembled(file, stars, context, sources, timed=timed, on_screen=on_screen)
 
 
+def full_scale_e_per_s(file: BenchFile) -> float:
+    """Light of a pixel at white, electrons per second in the tracker: as the file states it, else
+    as its bench has it. Raises InputError.
+    """
+    stated = file.config.render.flux_at_white_e_per_s
+    if stated is not None:
+        return stated
+    with open_bench(file) as bench:
+        return bench.flux_at_white_e_per_s
+
+
 def assembled(
     file: BenchFile,
     stars: Stars,

@@ -457,6 +457,12 @@ def test_controls_act_and_the_ledger_says_who(live, run):
     ]
 
 
+FOCUSED = """
+const element = document.activeElement;
+return [element.id, element.tagName, getComputedStyle(element).outlineStyle];
+"""
+
+
 def test_by_the_keyboard_alone(live):
     ActionChains(live).send_keys("?").perform()
     assert live.run("return document.getElementById('shortcuts').open")
@@ -468,12 +474,9 @@ def test_by_the_keyboard_alone(live):
     reached = set()
     for _ in range(60):
         ActionChains(live).send_keys(Keys.TAB).perform()
-        element = live.switch_to.active_element
-        reached.add(element.get_attribute("id"))
-        if element.tag_name == "button":
-            assert (
-                live.run("return getComputedStyle(arguments[0]).outlineStyle", element) == "solid"
-            )
+        name, tag, outline = live.run(FOCUSED)
+        reached.add(name)
+        assert tag != "BUTTON" or outline == "solid", name
     wanted = {
         "theme",
         "overlay-names",
@@ -532,9 +535,11 @@ def red_after_death_ms(page: Browser, shown: RunBeforeSky) -> float:
 
 
 @pytest.mark.timing
-def test_when_the_run_dies_the_page_is_red(page, tmp_path):
-    with sky(tmp_path) as shown, CoreWaits(page.service.process.pid) as waited:
-        took_ms = red_after_death_ms(page, shown)
+def test_when_the_run_dies_the_page_is_red(page, run):
+    """The last test of this run."""
+    run.sending.set()
+    with CoreWaits(page.service.process.pid) as waited:
+        took_ms = red_after_death_ms(page, run)
     headline = "document.getElementById('health-headline').textContent"
     page.until(f"{headline} === 'No word from hilstar'")
     page.until("document.getElementById('control-state').textContent === 'no connection'")

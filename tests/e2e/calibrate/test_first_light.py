@@ -24,6 +24,7 @@ from hilstar.display.calibration import (
     CalibrationHead,
     NotesTable,
     load_calibration,
+    read_toml,
     write_calibration,
 )
 from hilstar.display.geometry import ErrorTable, MadeTable, Notes, write_geometry
@@ -261,6 +262,10 @@ def test_the_commands_of_calibrate_give_the_figures_of_the_steps(whole, tmp_path
     assert light["black_level"]["relative"] == pytest.approx(
         steps["photometry"]["black_level"], rel=SAME
     )
+    own, again = (folder / "s" / "response.toml", tmp_path / "response.toml")
+    assert read_toml(own).errors == read_toml(again).errors
+    responses = [load_calibration(path, 10).response.light for path in (own, again)]
+    assert np.array_equal(*responses)
     # As the bench file was before the step: white as it had it.
     text = (folder / "bench.toml").read_text()
     before = folder / "before-scale.toml"
@@ -343,17 +348,17 @@ def untouched(taken):
 @pytest.mark.usefixtures("without_charts")
 def test_a_session_that_is_stopped_or_killed_half_way_says_so_and_goes_on_where_it_was(tmp_path):
     folder = plant(tmp_path, rotate_deg=90)
-    for image, ending in (("frame_003", signal.SIGINT), ("frame_007", signal.SIGKILL)):
-        with started(folder, *FEW) as process:
-            taken = ended_at(process, folder, f"geometry-1/{image}", ending)
-            assert process.returncode == (-ending if ending == signal.SIGKILL else 128 + ending)
-            assert "Traceback" not in process.stderr.read()
-        session = json.loads((folder / "s" / "session.json").read_text())
-        assert session["running"] == "geometry"
-        assert [step["name"] for step in session["steps"]] == STEPS[:5]
+    with started(folder, *FEW) as process:
+        taken = ended_at(process, folder, "geometry-1/frame_007", signal.SIGKILL)
+        assert process.returncode == -signal.SIGKILL
+        assert "Traceback" not in process.stderr.read()
+    session = json.loads((folder / "s" / "session.json").read_text())
+    assert session["running"] == "geometry"
+    assert [step["name"] for step in session["steps"]] == STEPS[:5]
     with started(folder, *FEW) as process:
         readings = ended_at(process, folder, "photometry-1/patch_010", signal.SIGTERM)
         assert process.returncode == 128 + signal.SIGTERM
+        assert "Traceback" not in process.stderr.read()
     assert untouched(taken) == len(taken) - 1 > 6
     resumed = virtually(folder, *FEW)
     assert resumed.returncode == 0, resumed.stderr

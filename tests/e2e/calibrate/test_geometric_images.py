@@ -16,7 +16,7 @@ from scipy.special import ndtr
 
 from hilstar.instruments.calibrate.geometric.dots import read_plan
 from tests.e2e.calibrate.test_geometric import BENCH, FILE, STARS_ARCSEC, TRACKER, TRACKER_PX
-from tests.support.commands import assert_refused, run_hilstar_here, typed
+from tests.support.commands import assert_refused, run_hilstar_here
 
 SIGMA_PX, PEAK_DN, FLOOR_DN, NOISE_DN = 1.1, 9000.0, 400.0, 12.0
 HOT = 150  # pixels
@@ -66,27 +66,29 @@ def session(tmp_path_factory):
     return folder
 
 
-def images_in(folder):
-    return sorted(folder.glob("frame_*.fits")) + sorted(folder.glob("frame_*.png"))
+def words_for(session, plan):
+    """The command with its session, but for the images."""
+    words = ["calibrate", "geometric", session / "bench.toml", "--plan", plan, "--json"]
+    return [*words, "--tracker-is-ideal", "--dark", session / "dark.fits"]
 
 
-def test_images_give_what_centroids_give(session):
-    wanted = typed(f"--plan {session}/plan -o {session}/geometry.toml --tracker-is-ideal --json")
-    result = run_hilstar_here(
-        "calibrate",
-        "geometric",
-        session / "bench.toml",
-        *images_in(session),
-        *wanted,
-        "--dark",
-        session / "dark.fits",
-    )
+@pytest.fixture(scope="module")
+def given(session):
+    """What the command says of the images' files, in the order of their frames."""
+    # which rounding follows
+    files = [*session.glob("frame_*.fits"), *session.glob("frame_*.png")]
+    files.sort(key=lambda path: path.stem)
+    words = words_for(session, session / "plan")
+    result = run_hilstar_here(*words, "-o", session / "geometry.toml", *files)
     assert result.returncode == 0, result.stderr
-    found = json.loads(result.stdout)
-    assert found["noise_px"] < 0.02
-    assert found["centroids"]["false"] < 0.02 * found["centroids"]["given"]
-    assert found["held_out"]["rms_arcsec"] < IMAGES_ARCSEC[0] * 2
-    assert found["error"]["max_arcsec"] < IMAGES_ARCSEC[1]
+    return json.loads(result.stdout)
+
+
+def test_images_give_what_centroids_give(given):
+    assert given["noise_px"] < 0.02
+    assert given["centroids"]["false"] < 0.02 * given["centroids"]["given"]
+    assert given["held_out"]["rms_arcsec"] < IMAGES_ARCSEC[0] * 2
+    assert given["error"]["max_arcsec"] < IMAGES_ARCSEC[1]
 
 
 def grabbing(session, folder):
@@ -102,22 +104,16 @@ def grabbing(session, folder):
     return f"{sys.executable} {script} {{output}} {{pattern}}"
 
 
-def test_images_that_are_taken_here_give_what_their_files_give(session, tmp_path):
+def test_images_that_are_taken_here_give_what_their_files_give(session, given, tmp_path):
     plan = tmp_path / "plan"
     shutil.copytree(session / "plan", plan)
-    words = ["calibrate", "geometric", session / "bench.toml", "--plan", plan, "--json"]
-    words += ["--tracker-is-ideal", "--dark", session / "dark.fits"]
+    words = words_for(session, plan)
     grab = ("--grab", grabbing(session, tmp_path))
-    taken = run_hilstar_here(*words, "-o", tmp_path / "taken.toml", *grab)
-    assert taken.returncode == 0, taken.stderr
-    assert "frame_011: image 12 of 12" in taken.stderr
-    # in the order of their frames, which rounding follows
-    files = sorted(images_in(session), key=lambda path: path.stem)
-    given = run_hilstar_here(*words, "-o", tmp_path / "given.toml", *files)
-    figures = [json.loads(run.stdout) for run in (taken, given)]
-    for found in figures:
-        del found["written"]
-    assert figures[0] == figures[1]
+    run = run_hilstar_here(*words, "-o", tmp_path / "taken.toml", *grab)
+    assert run.returncode == 0, run.stderr
+    assert "frame_011: image 12 of 12" in run.stderr
+    taken = json.loads(run.stdout)
+    assert taken == given | {"written": taken["written"]}
     again = run_hilstar_here(*words, "-o", tmp_path / "again.toml", *grab)
     assert_refused(again, 2, "has images", "--overwrite")
 

@@ -199,7 +199,13 @@ def test_a_real_tracker_s_rates_and_stamps_are_judged_over_udp(tmp_path: Path, c
     (tmp_path / "plan.toml").write_text(SLEWS)
     now = str(tmp_path / "out" / "slews" / "now.json")
     planted = replace(
-        stub, now=now, wild=0.0, stamp_bias_s=0.1, latency_s=0.15, rate_bias_deg_s=(0.0, 0.03, 0.0)
+        stub,
+        now=now,
+        answer_hz=20.0,
+        wild=0.0,
+        stamp_bias_s=0.1,
+        latency_s=0.15,
+        rate_bias_deg_s=(0.0, 0.03, 0.0),
     )
     words = ["accept", "bench.toml", "--plan", "plan.toml", "-o", "out", "--headless", "--json"]
     # on a clock of its own the rates alone are judged, and fewer cases show them
@@ -227,7 +233,7 @@ def test_a_real_tracker_s_rates_and_stamps_are_judged_over_udp(tmp_path: Path, c
 STARS = """
 through = "bench"
 [cases.stars]
-cases = 16
+cases = 10
 frames = 4
 timeout_s = 5.0
 """
@@ -297,7 +303,7 @@ def test_planted_faults_of_single_stars_are_found_over_udp(tmp_path: Path) -> No
         + (f"minimum = {1.2 * size}\n" if quantity == "star-limit" else f"maximum = {size / 2}\n")
         for quantity, size in PLANTED_STARS.items()
     ]
-    (tmp_path / "plan.toml").write_text(STARS.replace("16", "40") + "".join(clauses))
+    (tmp_path / "plan.toml").write_text(STARS.replace("10", "24") + "".join(clauses))
     planted = replace(
         stub,
         now=str(tmp_path / "out" / "stars" / "now.json"),

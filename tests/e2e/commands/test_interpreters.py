@@ -1,5 +1,6 @@
-"""The wheel in every other Python that this machine has and hilstar takes: a frame, an exposure,
-and the facade. README's first command does the same by the system's own.
+"""The wheel in the newest other Python that this machine has and hilstar takes: a frame, an
+exposure, and the facade. README's first command does the same by the system's own: what a Python
+between the two took away, the newest lacks too.
 """
 
 from __future__ import annotations
@@ -85,7 +86,7 @@ def wheel(tmp_path_factory) -> Path:
 
 
 @pytest.mark.skipif(not others(), reason="this machine has no other Python that hilstar takes")
-@pytest.mark.parametrize("version", others())
+@pytest.mark.parametrize("version", list(others())[-1:])
 def test_the_wheel_works_in_another_python(version, wheel, tmp_path):
     done(others()[version], "-m", "venv", ".venv", cwd=tmp_path)
     programs = tmp_path / ".venv" / "bin"

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from hilstar.server.console.server.connections import MAX_CONNECTIONS, PONG_S
+from hilstar.server.console.server.connections import MAX_CONNECTIONS
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.pages import PageAddress, children, live, page_of, raw
 from tests.support.senders import free_port
@@ -273,10 +273,6 @@ def missed_and_frames(page: PageAddress) -> tuple[int, int]:
     return counts["missed"], counts["frames"]
 
 
-def clients(page: PageAddress) -> float:
-    return float(page.ask("/metrics")[2].decode().split("\nhilstar_console_clients ")[1].split()[0])
-
-
 def resident_mb(pid: int) -> float:
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
 
@@ -392,9 +388,9 @@ def test_a_wish_beyond_bounds_is_one_within_them(local, text):
     assert children(served.process.pid, "hilstar.server.console.server") == before
 
 
-def test_pages_that_do_not_read_never_lock_the_operator_out_and_are_closed(local):
+def test_pages_that_do_not_read_never_lock_the_operator_out(local):
     """More of them than there are places, as browsers' pages with wishes: each that comes later
-    has a place all the same.
+    has a place all the same. tests/unit/server/console/test_page_server.py holds that they end.
     """
     served, page = local
     own = {"Origin": f"http://127.0.0.1:{page.port}"}
@@ -408,7 +404,7 @@ def test_pages_that_do_not_read_never_lock_the_operator_out_and_are_closed(local
             link.await_message(lambda said: isinstance(said, bytes))
             for each in [stack.enter_context(live(page, own)) for _ in range(40)]:
                 each.want(picture=True, hz=10)
-            link.await_message(lambda _: clients(page) == 1, 10 * PONG_S)
+            link.await_message(lambda said: isinstance(said, bytes))
     assert children(served.process.pid, "hilstar.server.console.server") == before
 
 

@@ -23,7 +23,7 @@ from tests.support.senders import free_port
 from tests.support.waiting import PATIENCE_S, wait_for
 
 pytestmark = pytest.mark.e2e
-WATCHDOG_S = 1.0
+WATCHDOG_S = 0.4
 RESTART_S = 0.2  # RestartSec of the unit
 BACK_S = 3.0
 

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 import zmq
 
+from hilstar.attitude.wire import apart
 from hilstar.attitude.wire.packet import AnswerPacket, encode, framed
 from hilstar.basics.errors import HilstarError
 from hilstar.basics.notices import Notices
@@ -367,8 +368,9 @@ def decode(data):
 
 @pytest.mark.parametrize("poison", [b"loop", b"sleep", b"exit"])
 def test_a_function_that_does_not_return_is_ended_and_named_and_the_next_answers_come(
-    tmp_path, caplog, poison
+    tmp_path, caplog, monkeypatch, poison
 ):
+    monkeypatch.setattr(apart, "LOOPS_S", 0.3)
     (tmp_path / "looping_tracker.py").write_text(LOOPING)
     keys = (
         f'source = "udp"\nbind = "127.0.0.1:{(port := free_port())}"\nformat ='

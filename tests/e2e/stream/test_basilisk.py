@@ -4,8 +4,6 @@ the ledger.
 
 from __future__ import annotations
 
-import json
-import signal
 import time
 
 import numpy as np
@@ -20,7 +18,7 @@ from tests.support.senders import free_port, publisher
 from tests.support.servers import interrupted, listening, serving
 from tests.support.sources.basilisk import Truth, basilisk, rotation
 from tests.support.sources.viz_message import craft, viz_message
-from tests.support.waiting import PATIENCE_S, is_connected_to, wait_for
+from tests.support.waiting import is_connected_to, wait_for
 
 # Two degrees a second, from just under |sigma| = 1: the switch to the shadow set comes within half
 # a second. The other spacecraft is elsewhere, so that a choice of the wrong one is seen.
@@ -108,7 +106,7 @@ def test_stars_of_every_frame_are_where_basilisk_s_truth_has_them(broadcast):
 
 
 def test_in_lockstep_every_step_is_one_frame(tmp_path):
-    """As fast as both go: two seconds of simulation in forty steps, each with the place from
+    """As fast as both go: a second of simulation in twenty steps, each with the place from
     which the Earth is seen.
     """
     port = free_port()
@@ -120,7 +118,7 @@ def test_in_lockstep_every_step_is_one_frame(tmp_path):
         "spacecraft": {"orbit": "source"},
     }
     (tmp_path / "bench.toml").write_text(bench_text(BENCH, seen))
-    scenario = {"mode": "liveStream", "port": port, "shown_s": 0.05, "stops_s": [2.0]}
+    scenario = {"mode": "liveStream", "port": port, "shown_s": 0.05, "stops_s": [1.0]}
     with (
         basilisk(tmp_path, **scenario, spacecraft={"chaser": CHASER}) as simulation,
         listening(
@@ -130,38 +128,14 @@ def test_in_lockstep_every_step_is_one_frame(tmp_path):
         simulation.run()
         summary = interrupted(served)
     truth, frames = Truth(tmp_path), messages_by_topic(tmp_path / "run.mcap")["/frame"]
-    assert [frame["t_ns"] for frame in frames] == [50_000_000 * k for k in range(1, 41)]
-    assert summary["packets"]["received"] == summary["packets"]["accepted"] == 40
+    assert [frame["t_ns"] for frame in frames] == [50_000_000 * k for k in range(1, 21)]
+    assert summary["packets"]["received"] == summary["packets"]["accepted"] == 20
     for frame in frames:
         row = truth.row(frame["t_ns"])
         true = rotation(MOUNTING) * truth.body_from_n[row]
         assert (rotation(frame["q"]) * true.inv()).magnitude() < SAMPLE_LIMIT_RAD
         assert frame["place_km"] == pytest.approx(truth.r_bn_n[row] / 1000)
         assert frame["velocity_km_s"] == pytest.approx(truth.v_bn_n[row] / 1000)
-
-
-def test_two_spacecraft_and_no_name_end_the_simulation_with_their_names(tmp_path):
-    """Neither is shown for the other."""
-    port = free_port()
-    attitude = {"source": "vizard", "lockstep": True, "endpoint": f"tcp://127.0.0.1:{port}"}
-    (tmp_path / "bench.toml").write_text(bench_text({"attitude": attitude}))
-    scenario = {"mode": "liveStream", "port": port, "shown_s": 0.5, "stops_s": [1.0]}
-    with (
-        basilisk(
-            tmp_path, **scenario, spacecraft={"chaser": CHASER, "target": TARGET}
-        ) as simulation,
-        listening(tmp_path / "bench.toml", "bound to", "--duration", "30") as served,
-    ):
-        told = simulation.run(code=1)
-        served.send_signal(signal.SIGINT)
-        out, err = served.communicate(timeout=PATIENCE_S)
-    assert "Error processing SIM_UPDATE" in told
-    assert served.returncode == 4
-    assert (
-        'spacecraft: chaser, target; write the one that is meant, [attitude] spacecraft = "NAME"'
-        in err
-    )
-    assert json.loads(out)["packets"]["refused_by"]["format"] == 1
 
 
 def test_broken_messages_among_good_ones_are_refused_and_other_topics_do_not_count(tmp_path):

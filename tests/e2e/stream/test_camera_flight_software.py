@@ -32,9 +32,9 @@ from tests.support.waiting import PATIENCE_S, wait_for
 pytestmark = pytest.mark.e2e
 
 SIDE_PX = TWIN["tracker"]["resolution_px"][0]
-SWING_DEG, SWING_S = 1.0, 8.0  # at most 0.8 deg/s: 1.3 px in an exposure
-IMAGES = 120
-FRAMES, TRIGGERS = 20, 6
+SWING_DEG, SWING_S = 0.5, 4.0  # at most 0.8 deg/s: 1.3 px in an exposure
+IMAGES = 60
+FRAMES, TRIGGERS = 8, 6
 # Of the tracker alone: 400 x 400 pixels of 107 arcsec, some 20 stars; measured 0.6 and 0.9 arcsec.
 OWN_ARCSEC = (10.0, 10.0, 60.0)
 MAX_CLOCK_MS = 2.0
@@ -158,7 +158,7 @@ print(json.dumps(numbers))
 @pytest.mark.parametrize("form", ["Mono12", "Mono12Packed", "Mono16"])
 def test_the_frames_of_simulate_come_through_the_camera_bit_for_bit(simulated, tmp_path, form):
     settings = CameraSettings(SIDE_PX, SIDE_PX, 12, 0.04, 20.0)
-    count, taken = 3 * FRAMES, tmp_path / "taken"
+    count, taken = 2 * FRAMES, tmp_path / "taken"
     with running_camera(settings, lambda k: simulated[k % FRAMES]) as address:
         command = [SYSTEM_PYTHON, "-c", GRABBER, address, form, str(count), taken]
         run = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -8,8 +8,6 @@ import json
 import sys
 from pathlib import Path
 
-import pytest
-
 from hilstar.server.record.ledger_records import EventRecord, run_records
 from tests.support.benches import SMALL_BENCH, still_log
 from tests.support.commands import run_hilstar_here, run_started
@@ -23,7 +21,9 @@ import sys
 from hilstar.server.bench import build
 from hilstar.cli import run_command
 from hilstar.basics.process.scheduling import HostClock
+from hilstar.server import watchdog
 
+watchdog.GPU_LOOK_NS = 10**8  # in place of a second
 harm, wanted, slept_s = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
 benches, looks = [], 0
 opened = build.open_bench
@@ -59,7 +59,7 @@ for module in list(sys.modules.values()):  # whoever has imported it already, to
         module.open_bench = open_bench
 sys.exit(run_command(sys.argv[4:]))
 """
-LOG_S = 4
+LOG_S = 1
 
 
 def harmed_replay(
@@ -106,9 +106,9 @@ def assert_ended_early(ran, ledger: Path, folder: Path, *words: str) -> None:
     assert json.loads(told.stdout)["frames"] == summary["frames"]
 
 
-@pytest.mark.parametrize("quantisation", ["round", "dither", "exact"])
-def test_a_table_that_changed_in_sleep_ends_the_run(tmp_path, quantisation):
-    ran, ledger = harmed_replay(tmp_path, "table", 60.0, quantisation=quantisation)
+def test_a_table_that_changed_in_sleep_ends_the_run(tmp_path):
+    """tests/gpu/test_driver.py holds that a change of any table of any quantisation is seen."""
+    ran, ledger = harmed_replay(tmp_path, "table", 60.0, quantisation="exact")
     assert_ended_early(ran, ledger, tmp_path, "memory was lost in sleep, 1 of the tables")
     assert "the machine slept for 60.0 s" in ran.stderr
 

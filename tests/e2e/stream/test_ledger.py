@@ -50,11 +50,14 @@ def send_turn(sender, count: int) -> None:
         time.sleep(0.01)
 
 
-def served_ledger(tmp_path, *options: str) -> tuple[Path, dict]:
-    ledger = tmp_path / "run.mcap"
+@pytest.fixture(scope="module")
+def served_ledger(tmp_path_factory) -> tuple[Path, dict]:
+    """The ledger of a turn, and the run's summary."""
+    folder = tmp_path_factory.mktemp("served")
+    ledger = folder / "run.mcap"
     with (
         publisher() as (sender, port),
-        serving(tmp_path, port, "--ledger", str(ledger), *options) as process,
+        serving(folder, port, "--ledger", str(ledger)) as process,
     ):
         process.shows()
         send_turn(sender, 100)
@@ -63,8 +66,8 @@ def served_ledger(tmp_path, *options: str) -> tuple[Path, dict]:
         return ledger, summary_of(process)
 
 
-def test_every_packet_and_every_frame_is_there(tmp_path):
-    ledger, summary = served_ledger(tmp_path)
+def test_every_packet_and_every_frame_is_there(served_ledger):
+    ledger, summary = served_ledger
     assert summary["ledger"] == {"path": str(ledger), "failure": None, "unrecorded": 0}
     found = messages_by_topic(ledger)
     assert len(found["/attitude"]) == summary["packets"]["received"] == 110
@@ -121,19 +124,16 @@ def test_what_was_drawn_is_drawn_again_bit_for_bit(tmp_path):
     assert (first / "frames.csv").read_text() == (second / "frames.csv").read_text()
 
 
-def test_a_live_run_s_ledger_is_an_attitude_log_too(tmp_path):
-    ledger, _ = served_ledger(tmp_path)
+def test_a_live_run_s_ledger_is_an_attitude_log_too(tmp_path, served_ledger):
+    ledger, _ = served_ledger
+    bench = ledger.with_name("serve.toml")
     samples = read_log(ledger)
     assert len(samples) == 100
     converted = run_hilstar_here("convert", ledger, tmp_path / "run.csv")
     assert "100 attitudes" in converted.stdout
-    replayed = run_hilstar_here(
-        "replay", tmp_path / "serve.toml", ledger, "--headless", "--speed", "max", "--json"
-    )
+    replayed = run_hilstar_here("replay", bench, ledger, "--headless", "--speed", "max", "--json")
     assert json.loads(replayed.stdout)["frames"] == len(list(drawable_frames(ledger)))
-    refused = run_hilstar_here(
-        "replay", tmp_path / "serve.toml", ledger, "--headless", "--step", "1"
-    )
+    refused = run_hilstar_here("replay", bench, ledger, "--headless", "--step", "1")
     assert_refused(refused, 2, "run.mcap", "--step")
 
 
@@ -143,14 +143,14 @@ def test_after_a_kill_all_but_the_last_half_second_can_be_read(tmp_path):
     with publisher() as (sender, port), serving(tmp_path, port, "--ledger", str(ledger)) as process:
         process.shows()
         with CoreWaits(process.pid) as waited:
-            send_turn(sender, 150)
+            send_turn(sender, 100)
             process.kill()
             process.wait()
     found, frames = read_log(ledger), list(drawable_frames(ledger))
     assert found and frames
     # The bench's clock began 50 s before its stream, which ended at the kill: frames and packets
     # reach to half a second of it.
-    within_ns = 50_000_000_000 + 1_500_000_000 - 600_000_000 - waited.s * NS_PER_S
+    within_ns = 50_000_000_000 + 1_000_000_000 - 600_000_000 - waited.s * NS_PER_S
     assert found[-1].t_ns > within_ns and frames[-1].t_ns > within_ns, (
         found[-1].t_ns,
         frames[-1].t_ns,
@@ -164,7 +164,7 @@ def test_a_full_disk_ends_the_ledger_and_not_the_display(tmp_path):
     bench = tmp_path / "bench.toml"
     with publisher() as (sender, port):
         bench.write_text(f'{LIVE_BENCH}\n[attitude]\nendpoint = "tcp://127.0.0.1:{port}"\n')
-        command = typed(f"serve {bench} --headless --json --ledger {ledger} --duration 2")
+        command = typed(f"serve {bench} --headless --json --ledger {ledger} --duration 1.5")
         limited = (
             f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({LIMIT_BYTES},"
             f" {LIMIT_BYTES}))"
@@ -177,14 +177,14 @@ def test_a_full_disk_ends_the_ledger_and_not_the_display(tmp_path):
             assert process.stderr is not None
             process.stderr.readline()
             await_subscriber(sender)
-            send_turn(sender, 200)
+            send_turn(sender, 140)
             out, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 1, err
     summary = json.loads(out)
     assert "the display goes on" in err
     assert summary["ledger"]["failure"]
     assert summary["ledger"]["unrecorded"] > 0
-    assert summary["frames"] + summary["missed_frames"] == 120
+    assert summary["frames"] + summary["missed_frames"] == 90
     assert len(read_log(ledger)) > 20
 
 
@@ -261,7 +261,7 @@ def test_a_flood_of_wrong_packets_is_counted_and_the_ledger_stays_small(tmp_path
     ledger = tmp_path / "run.mcap"
     with publisher() as (sender, port), serving(tmp_path, port, "--ledger", str(ledger)) as process:
         process.shows()
-        end_s = time.monotonic() + 2
+        end_s = time.monotonic() + 1
         sent = 0
         while time.monotonic() < end_s:
             for _ in range(200):
@@ -284,13 +284,13 @@ def test_a_flood_of_wrong_packets_is_counted_and_the_ledger_stays_small(tmp_path
     assert sum(report["packets"].values()) == summary["packets"]["received"]
 
 
-def test_no_flipped_bit_changes_an_attitude_unsaid(tmp_path, rng):
-    ledger, _ = served_ledger(tmp_path)
+def test_no_flipped_bit_changes_an_attitude_unsaid(tmp_path, served_ledger, rng):
+    ledger, _ = served_ledger
     data = ledger.read_bytes()
     truth = [(s.t_ns, *s.q_icrs_to_cam) for s in read_log(ledger)]
     damaged = tmp_path / "damaged.mcap"
     said = 0
-    for place in rng.integers(0, 8 * len(data), 400):
+    for place in rng.integers(0, 8 * len(data), 200):
         wrong = bytearray(data)
         wrong[place // 8] ^= 1 << (place % 8)
         damaged.write_bytes(bytes(wrong))
@@ -301,4 +301,4 @@ def test_no_flipped_bit_changes_an_attitude_unsaid(tmp_path, rng):
             continue
         assert found == truth[: len(found)]
         assert len(found) == len(truth)
-    assert said > 300
+    assert said > 150

@@ -48,7 +48,7 @@ AS_DEG_S = (0.0, 0.0, TURN_DEG_S)  # as rad/s they turn the sky by 28 deg/s: 515
 # of a busy machine.
 MAX_OWN_ARCSEC = 0.5 * 3600 * TURN_DEG_S * 0.01
 MIN_BELIEVED_ARCSEC = 100.0  # of some 500 to 900, by how the packets fall between the frames
-FRAMES_AFTER = 90
+FRAMES_AFTER = 45
 
 
 def turned_by_time(t_ns: int, from_ns: int) -> tuple[float, ...]:

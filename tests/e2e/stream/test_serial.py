@@ -59,11 +59,11 @@ def test_two_hundred_a_second_arrive_none_lost_none_refused_and_both_sides_talk(
     with listening(wire_file, "reading serial:") as process:
         process.shows()
         told = sent(
-            f"serial:{cable.sender}@{BAUD}", "--spin", "z,1", "--rate", "200", "--count", "600"
+            f"serial:{cable.sender}@{BAUD}", "--spin", "z,1", "--rate", "200", "--count", "400"
         )
-        process.has_received(600)
+        process.has_received(400)
         summary = interrupted(process)
-    assert told["sent"] == summary["packets"]["accepted"] == summary["packets"]["received"] == 600
+    assert told["sent"] == summary["packets"]["accepted"] == summary["packets"]["received"] == 400
     assert summary["packets"]["refused"] == 0
     assert told["requests"] >= 2 and told["statuses"] >= 2, told
     clock = summary["clock"]
@@ -84,15 +84,15 @@ def test_lost_corrupted_and_reordered_packets_add_up(cable, wire_file):
             "--rate",
             "400",
             "--count",
-            "800",
+            "400",
             *faults,
         )
         process.has_received(told["sent"])
         summary = interrupted(process)
     packets = summary["packets"]
-    assert told["packets"] == 800
+    assert told["packets"] == 400
     assert told["lost"] and told["corrupted"] and told["reordered"]
-    assert packets["received"] == told["sent"] == 800 - told["lost"]
+    assert packets["received"] == told["sent"] == 400 - told["lost"]
     assert packets["refused_by"]["crc"] == told["corrupted"]
     assert packets["refused_by"]["time"] == told["reordered"]
     assert packets["accepted"] == packets["received"] - told["corrupted"] - told["reordered"]
@@ -151,7 +151,7 @@ def test_a_line_that_filled_up_while_the_display_was_made_ready_misleads_nobody(
         sender.start()
         time.sleep(1.5)
         shown = []
-        summary = msgspec.to_builtins(serve(bench, link, Limit(slots=240), shown.append))
+        summary = msgspec.to_builtins(serve(bench, link, Limit(slots=150), shown.append))
         age_ns = median_age_ns(shown)
         stop.set()
         sender.join()
@@ -177,7 +177,7 @@ def test_a_device_that_goes_and_comes_back_is_picked_up_within_a_second(tmp_path
         )
         process.has_received(50)
         cable.pull()
-        time.sleep(1.0)
+        time.sleep(0.6)
         cable.plug()
         with CoreWaits(process.pid) as waited:
             plugged_s = time.monotonic()
@@ -195,11 +195,11 @@ def test_a_device_that_goes_and_comes_back_is_picked_up_within_a_second(tmp_path
         summary = interrupted(process)
     assert summary["reconnects"] == 1
     assert summary["packets"]["accepted"] == 100
-    # a second where the last packet is old before the end
+    # the last packet is old before the line is back
     assert summary["stale_events"] >= 1, summary
-    # Frames go on at 60 Hz through the whole second without a line and the rest, to the last one
+    # Frames go on at 60 Hz through the 0.6 s without a line and the rest, to the last one
     # begun.
-    assert lasted_s > 2.0
+    assert lasted_s > 1.6
     assert summary["frames"] + summary["missed_frames"] >= 60 * lasted_s - 2
 
 

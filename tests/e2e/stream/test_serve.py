@@ -63,8 +63,8 @@ SUMMARY_KEYS |= {
 
 
 @pytest.mark.timing
-def test_a_thousand_packets_at_200_hz_all_arrive_with_garbage_between_them(tmp_path):
-    """1000 good ones; after every tenth, one each of: wrong CRC, NaN, norm, an old count, and bytes
+def test_packets_at_200_hz_all_arrive_with_garbage_between_them(tmp_path):
+    """400 good ones; after every tenth, one each of: wrong CRC, NaN, norm, an old count, and bytes
     of no form.
     """
     with (
@@ -74,7 +74,7 @@ def test_a_thousand_packets_at_200_hz_all_arrive_with_garbage_between_them(tmp_p
     ):
         process.shows()
         start = time.monotonic_ns()
-        for k in range(1000):
+        for k in range(400):
             t_ns = start + k * 5_000_000
             time.sleep(max(0, (t_ns - time.monotonic_ns()) / 1e9))
             sender.send(packet(k, t_ns))
@@ -86,26 +86,26 @@ def test_a_thousand_packets_at_200_hz_all_arrive_with_garbage_between_them(tmp_p
                 sender.send(packet(k, t_ns + 1, q=(1.1, 0, 0, 0)))
                 sender.send(packet(k, t_ns - 1))
                 sender.send(np.random.default_rng(k).bytes(50))
-        process.has_received(1500)
+        process.has_received(600)
         process.send_signal(signal.SIGINT)
         summary = summary_of(process)
     packets = summary["packets"]
-    assert packets["accepted"] == 1000
-    assert packets["received"] == 1500
+    assert packets["accepted"] == 400
+    assert packets["received"] == 600
     assert packets["refused_by"] == {
-        "crc": 100,
-        "norm": 100,
-        "nan": 100,
+        "crc": 40,
+        "norm": 40,
+        "nan": 40,
         # a count that comes twice, at another time, is a second sender's
-        "source": 100,
+        "source": 40,
         "time": 0,
-        "format": 100,
+        "format": 40,
     }
-    assert packets["refused"] == 500
-    # A frame or a missed one for each sixtieth of the five seconds, whatever else the machine had
+    assert packets["refused"] == 200
+    # A frame or a missed one for each sixtieth of the two seconds, whatever else the machine had
     # to do.
-    assert summary["frames"] + summary["missed_frames"] >= 299
-    assert summary["frames"] + missed_in(waited.s) > 200, (summary, waited.s)
+    assert summary["frames"] + summary["missed_frames"] >= 119
+    assert summary["frames"] + missed_in(waited.s) > 80, (summary, waited.s)
     assert summary["stars_drawn"]["max"] > 0
     assert set(summary) == SUMMARY_KEYS
 
@@ -113,14 +113,14 @@ def test_a_thousand_packets_at_200_hz_all_arrive_with_garbage_between_them(tmp_p
 def test_a_clean_stream_is_refused_nothing(tmp_path):
     with publisher() as (sender, port), serving(tmp_path, port) as process:
         process.shows()
-        for k in range(400):
+        for k in range(200):
             sender.send(packet(k, time.monotonic_ns()))
             time.sleep(0.0025)
-        process.has_received(400)
+        process.has_received(200)
         process.shows(process.counts()[0] + 2)
         process.send_signal(signal.SIGTERM)
         summary = summary_of(process)
-    assert (summary["packets"]["received"], summary["packets"]["refused"]) == (400, 0)
+    assert (summary["packets"]["received"], summary["packets"]["refused"]) == (200, 0)
     for key in ("p50", "p99", "max"):
         assert summary["attitude_age_ms"][key] is not None
 
@@ -191,14 +191,14 @@ def test_hilstar_send_is_heard_by_serve_that_binds(tmp_path):
     port = free_port()
     with serving(tmp_path, port, attitude="bind = true") as process:
         sent = run_hilstar(
-            f"send --spin z,1.5 --rate 200 --count 300 --to tcp://127.0.0.1:{port} --connect"
+            f"send --spin z,1.5 --rate 200 --count 100 --to tcp://127.0.0.1:{port} --connect"
         )
         assert sent.returncode == 0, sent.stderr
-        assert "300 packets sent" in sent.stderr
-        process.has_received(300)
+        assert "100 packets sent" in sent.stderr
+        process.has_received(100)
         process.send_signal(signal.SIGINT)
         packets = summary_of(process)["packets"]
-    assert (packets["received"], packets["refused"]) == (300, 0)
+    assert (packets["received"], packets["refused"]) == (100, 0)
 
 
 def test_a_log_sent_at_a_rate_is_resampled(tmp_path):
@@ -343,7 +343,7 @@ def test_with_keys_a_known_client_is_heard_and_a_stranger_is_not(tmp_path):
         ' "mine/allowed_clients"'
     )
     with serving(tmp_path, port, attitude=keys) as process:
-        for directory, waits in (("strange", "1"), ("mine", "10")):
+        for directory, waits in (("strange", "0.5"), ("mine", "10")):
             client = tmp_path / directory / "client.key_secret"
             options = [
                 "--secret-key",
@@ -365,7 +365,7 @@ def test_with_keys_a_known_client_is_heard_and_a_stranger_is_not(tmp_path):
                 "200",
             ]
             assert run_hilstar("send", *to, *options).returncode == 0
-        plain = run_hilstar("send", *to, "--wait", "1")
+        plain = run_hilstar("send", *to, "--wait", "0.5")
         assert "no listener" in plain.stderr
         process.has_received(40)
         process.send_signal(signal.SIGINT)
@@ -374,13 +374,13 @@ def test_with_keys_a_known_client_is_heard_and_a_stranger_is_not(tmp_path):
 
 
 def test_a_flood_is_bounded_and_the_display_goes_on(tmp_path):
-    """50 000 messages of 200 kB as fast as they go: what hilstar keeps of them is bounded, and
+    """Messages of 200 kB as fast as they go, for 1.2 s: what hilstar keeps of them is bounded, and
     frames go on.
     """
     with publisher() as (sender, port), serving(tmp_path, port) as process:
         process.shows()
         message = bytes(200_000)
-        end = time.monotonic() + 2.5
+        end = time.monotonic() + 1.2
         most_kb = 0
         while time.monotonic() < end:
             sender.send(message)
@@ -392,6 +392,6 @@ def test_a_flood_is_bounded_and_the_display_goes_on(tmp_path):
         process.send_signal(signal.SIGINT)
         summary = summary_of(process, code=4)  # none of them is an attitude
     assert summary["packets"]["refused_by"]["format"] > 100
-    assert summary["frames"] + summary["missed_frames"] >= 149
+    assert summary["frames"] + summary["missed_frames"] >= 71
     assert summary["frames"] > summary["missed_frames"] / 3
     assert most_kb < 1_000_000

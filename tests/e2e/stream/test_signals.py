@@ -32,7 +32,7 @@ WITHIN_S = 1.0
 LATE_S = 0.5
 # A command is ended once more in the midst of its work: what works begins children and files as it
 # goes, and what waits is where it stays by then.
-WORKING_S = 1.5
+WORKING_S = 1.2
 LATER_S = {"send": 0.3, "replay": 0.3, "lockstep": 0.3}
 NO_ATTITUDE = 4
 STUCK = """
@@ -306,7 +306,7 @@ def test_a_log_that_nobody_reads_holds_up_neither_the_frames_nor_the_end(tmp_pat
         )
         with Started(command, stdout=subprocess.PIPE, stderr=log) as process:
             try:
-                grown = [10_000, 30_000]  # and on
+                grown = [5_000, 15_000]  # and on
                 for size in grown:
                     wait_for(
                         lambda size=size: (
@@ -401,7 +401,7 @@ def test_a_sender_whose_listener_takes_nothing_ends_in_order(tmp_path):
                     process.stderr is not None
                     and b"waiting for a listener" in process.stderr.readline()
                 )
-                time.sleep(1.0)  # up to ten thousand packets: nothing more goes in
+                time.sleep(0.4)  # up to four thousand packets: nothing more goes in
                 code, out, err = ends(process, signal.SIGTERM)
             assert code == 0, err
             assert json.loads(out)["packets"] > 10

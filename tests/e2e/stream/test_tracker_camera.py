@@ -8,13 +8,12 @@ import json
 import re
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.support.benches import ROOT, TWIN, bench_text, still_log
+from tests.support.benches import TWIN, bench_text, still_log
 from tests.support.commands import HILSTAR
 from tests.support.forks import Started
 from tests.support.gige_client import GigEClient, opened, own_address
@@ -149,7 +148,7 @@ def test_aravis_finds_it_sets_it_and_loses_no_image(display):
         or subprocess.run(probe, capture_output=True, check=False).returncode
     ):
         pytest.skip("Aravis is not installed (gir1.2-aravis-0.8, python3-gi)")
-    address, count = own_address(), 20
+    address, count = own_address(), 10
     with tracker_with_camera(display, "--camera", address) as process:
         with GigEClient(address) as client:
             opened(client)
@@ -182,7 +181,7 @@ def test_aravis_s_own_test_of_cameras_finds_no_fault(display):
         with GigEClient(address) as client:
             opened(client)
         tested = subprocess.run(
-            [program, "-n", address, "-e", "60000", "--duration=5"],
+            [program, "-n", address, "-e", "60000", "--duration=2"],
             capture_output=True,
             text=True,
             check=False,
@@ -195,11 +194,3 @@ def test_aravis_s_own_test_of_cameras_finds_no_fault(display):
     # machine's; these are a camera's that breaks the standard.
     for fault in ("n_size_mismatch_errors", "n_error_packets"):
         assert int(counts[fault]) == 0, tested.stdout
-
-
-def test_without_answers_or_a_camera_it_says_what_to_write(display):
-    bench, endpoint = display
-    command = [sys.executable, "-m", "hilstar", "tracker", str(bench), "--watch", endpoint]
-    refused = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert refused.returncode == 2
-    assert "write --answer TARGET, --camera, or both" in refused.stderr

@@ -257,13 +257,13 @@ def unread_bytes(port: int) -> int:
 
 def test_a_flood_costs_little_and_its_newest_attitude_is_shown(tmp_path):
     port = free_port()
-    # For a second, and until stdin closes: a machine without a free core takes longer to send more
+    # For 0.3 s, and until stdin closes: a machine without a free core takes longer to send more
     # than may come.
     flood = (
         "import select, socket, sys, time\ns = socket.socket(2, 2)\ns.connect(('127.0.0.1',"
         " int(sys.argv[1])))\n"
     )
-    flood += "end = time.time() + 1\n"
+    flood += "end = time.time() + 0.3\n"
     flood += (
         "while time.time() < end or not select.select([0], [], [], 0)[0]: [s.send(b'?' * 64) for _"
         " in range(500)]"
@@ -288,7 +288,7 @@ def test_a_flood_costs_little_and_its_newest_attitude_is_shown(tmp_path):
     # one, and more where the sender stood still for a second
     assert 1 <= summary["events"]["flood"] <= 3
     assert summary["link"]["flooded"] > 500
-    assert summary["frames"] + summary["missed_frames"] >= 60
+    assert summary["frames"] + summary["missed_frames"] >= 30
 
 
 @pytest.mark.parametrize(

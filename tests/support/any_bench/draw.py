@@ -24,6 +24,8 @@ from hilstar.display.calibration import (
 from hilstar.display.geometry import ErrorTable, MadeTable, Notes, write_geometry
 from hilstar.display.response import srgb_response
 from hilstar.optics.camera import Camera, Lens
+from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.build import full_scale_e_per_s
 
 # Panels that labs have: kind, range of pixel pitch in um, sizes.
 PANELS = (
@@ -338,6 +340,7 @@ def write_bench(bench: DrawnBench, folder: Path) -> tuple[Path, Path]:
         "render": render,
     }
     (folder / "bench.toml").write_text(toml_text(tables))
+    white_e_per_s = full_scale_e_per_s(read_bench_file(folder / "bench.toml"))
     _write_true_light(panel, mounting, folder)
     size_px = panel.size_px if mounting.rotate_deg % 180 == 0 else panel.size_px[::-1]
     _write_true_lens(bench, size_px, folder)
@@ -362,21 +365,10 @@ def write_bench(bench: DrawnBench, folder: Path) -> tuple[Path, Path]:
             "focal_length_mm": round(bench.collimator_mm, 2),
             "geometry": "true-lens.toml",
         },
-        "render": {
-            "flux_at_white_e_per_s": _white_e_per_s(folder) * 10 ** (-0.4 * mounting.white_mag)
-        },
+        "render": {"flux_at_white_e_per_s": white_e_per_s * 10 ** (-0.4 * mounting.white_mag)},
     }
     (folder / "truth.toml").write_text(toml_text(truth))
     return folder / "bench.toml", folder / "truth.toml"
-
-
-def _white_e_per_s(folder: Path) -> float:
-    """Full scale as the bench file has it."""
-    from hilstar.server.bench.bench_file import read_bench_file
-    from hilstar.server.bench.build import open_bench
-
-    with open_bench(read_bench_file(folder / "bench.toml")) as bench:
-        return bench.flux_at_white_e_per_s
 
 
 def _write_true_light(panel: Panel, mounting: Mounting, folder: Path) -> None:

@@ -20,8 +20,8 @@ import numpy as np
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.units import ARCSEC_PER_RAD, magnitude
 from hilstar.display.calibration import read_toml
-from hilstar.instruments.certify.bench_readings import white_of
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
+from hilstar.server.bench.build import full_scale_e_per_s
 from hilstar.server.bench.cameras import bench_camera, tracker_camera
 from hilstar.server.bench.config.hardware import Monitor
 from hilstar.server.bench.monitor import bench_calibration
@@ -214,7 +214,7 @@ def _light(file: BenchFile, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
     monitor = file.config.monitor
     grid = bench_calibration(file.config, file.folder).uniformity_map(monitor.resolution_px)
     # A scale that agrees with the bench file's writes no key.
-    white = white_of(file)
+    white = full_scale_e_per_s(file)
     if grid is None:
         return np.full(len(x_px), white)
     columns, rows = np.rint(x_px).astype(np.intp), np.rint(y_px).astype(np.intp)

@@ -5,47 +5,97 @@ what it says of the engine's result is that result: the engines are the test's.
 from __future__ import annotations
 
 import json
-import math
+import socket
 import threading
 from collections.abc import Callable
+from importlib import import_module
+from inspect import signature
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
 
+from hilstar.attitude.wire.packet import Status, TimeRequest, encode
+from hilstar.attitude.wire.shown_frames import FrameHead, ShownFrame
 from hilstar.basics.errors import InputError
 from hilstar.basics.running_statistics import Percentiles
+from hilstar.basics.units import NS_PER_S
 from hilstar.cli import demo as demo_command
 from hilstar.cli import serve as serve_command
 from hilstar.cli import tracker as tracker_command
-from hilstar.cli.accept import _print_costs, _time_text
-from hilstar.cli.campaign import _scheduler, telling
-from hilstar.cli.demo import FOV_ARCSEC, PIXEL_ARCSEC, WRONG, TrackerBeside
+from hilstar.cli.accept import _time_text, costs_table
+from hilstar.cli.campaign import CampaignOptions, CaseOptions, _scheduler, telling
+from hilstar.cli.demo import (
+    FOV_ARCSEC,
+    PIXEL_ARCSEC,
+    WRONG,
+    TrackerBeside,
+    loop_figures,
+    print_loop,
+    say_missed,
+)
 from hilstar.cli.running import ActingPageOptions, DisplayOptions, RunOptions
 from hilstar.cli.send import heard
 from hilstar.cli.send import tell as tell_sent
 from hilstar.cli.serve import ServeOptions, heads_run
-from hilstar.cli.study import refuse_unused, study_lines
-from hilstar.cli.tracker import TrackerOptions, checked_rate, parse_silent, planted_errors, recorded
+from hilstar.cli.study import (
+    ROOMS,
+    TIMED,
+    WHOLE,
+    FieldOptions,
+    Study,
+    StudyOptions,
+    findings_of,
+    refuse_unused,
+)
+from hilstar.cli.tracker import (
+    TrackerOptions,
+    checked_rate,
+    counts_of,
+    parse_silent,
+    planted_errors,
+    recorded,
+)
 from hilstar.instruments.assess import assessment
+from hilstar.instruments.assess.budget import Axes
 from hilstar.instruments.calibrate import camera_edges, effective_psf
 from hilstar.instruments.calibrate import latency as by_diode
+from hilstar.instruments.calibrate.latency import Edges
 from hilstar.instruments.campaign import acceptance as acceptance_engine
 from hilstar.instruments.campaign import acceptance_page, acceptance_plan, pool
+from hilstar.instruments.campaign.acceptance_plan import CaseSet
+from hilstar.instruments.campaign.acceptance_verdicts import CostOfSet
 from hilstar.instruments.campaign.requirements import NOT_MET
 from hilstar.instruments.simulate import heads as twin_heads
 from hilstar.instruments.simulate import simulator
+from hilstar.instruments.simulate.answer_link import AnswerLink
+from hilstar.instruments.simulate.heads import HeadsErrors
+from hilstar.instruments.simulate.live_exposure import WatchedFrames
 from hilstar.instruments.simulate.tracker_process import SILENT_AFTER_S, Planted
 from hilstar.instruments.study.chain import run as chain
+from hilstar.instruments.study.engine import ChartFinding
+from hilstar.instruments.study.stability import CaseFigures, FailureCase
+from hilstar.instruments.study.sweep import Judged
 from hilstar.server.answers.answer import Answer
-from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.answers.judge import TrackerFigures
+from hilstar.server.bench.bench_file import HeadsFile, read_bench_file, read_bench_or_heads
 from hilstar.server.heads import HeadsRun
-from tests.support.benches import bench_text
+from hilstar.server.screen.screen import CODE, marker_light
+from hilstar.server.send_log import SendTally
+from hilstar.server.sender import UdpSender
+from tests.support.acceptance import accepted
+from tests.support.assessments import a_budget, an_assessment
+from tests.support.benches import SMALL_BENCH, bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.heads import heads_file
+from tests.support.planted_run import write_ledger
 from tests.support.refusals import refusal
+from tests.support.waiting import wait_for
 
+NO_STATUS = Status(0, 0, 0, 0, 0, 0, 0)
+PARTS = ("bias", "fov", "pixel")  # of a budget
 Q = np.array([0.5, -0.5, 0.5, -0.5])
 
 
@@ -75,11 +125,7 @@ def engine(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any, str, Any], Engine]
 
 def tracker_options(**words: Any) -> TrackerOptions:
     """The options of `hilstar tracker`, as typer gives them."""
-    known: dict[str, Any] = {
-        "bias": "0,0,0", "fov_error": 0.0, "pixel_error": 0.0, "wrong": "0", "silent": None,
-        "latency": 0.0, "clock_drift": 0.0, "clock_offset": 0.0,
-    }  # fmt: skip
-    return SimpleNamespace(**(known | words))  # type: ignore[return-value]
+    return TrackerOptions(bench_file=Path("bench.toml"), watch="tcp://127.0.0.1:1", **words)
 
 
 def test_each_planted_error_is_the_one_that_its_option_names() -> None:
@@ -143,34 +189,55 @@ def test_a_tracker_says_what_it_answered(capsys: pytest.CaptureFixture[str]) -> 
 
 
 def test_a_tracker_s_counts_are_those_of_its_parts() -> None:
-    live = SimpleNamespace(frames=SimpleNamespace(received=5, missing=2))
-    link = SimpleNamespace(endpoint="here", sent=7, babbled=3)
-    counts = tracker_command.counts_of(live, SimpleNamespace(refused=1), link, None)  # type: ignore[arg-type]
-    assert counts == {
-        "frames": {"received": 5, "missing": 2, "refused": 1},
-        "link": {"endpoint": "here", "sent": 7, "babbled": 3},
-    }
-    without = tracker_command.counts_of(live, SimpleNamespace(refused=0), None, None)  # type: ignore[arg-type]
-    assert "link" not in without and "camera" not in without
+    frames = WatchedFrames(lambda frame: np.ones((1, 1)))
+    for number in (1, 2, 5):
+        head = FrameHead(number, 1_000_000 * number, 4, 3, 8)
+        frames.add(ShownFrame(head, np.zeros(1, np.uint32), np.ones(1, np.uint8)))
+    received = {"received": 3, "missing": 2, "refused": 1}
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ear,
+        AnswerLink(heard_at(ear), "json", False, np.random.default_rng(1)) as link,
+    ):
+        link.send(Answer(5, b"", 1_500_000_001, Q))
+        assert counts_of(frames, 1, link, None) == {
+            "frames": received,
+            "link": {"endpoint": link.endpoint, "sent": 1, "babbled": 1},
+        }
+    assert counts_of(frames, 1, None, None) == {"frames": received}
+
+
+def heard_at(ear: socket.socket) -> str:
+    """The target at which a socket listens."""
+    ear.bind(("127.0.0.1", 0))
+    return f"udp://127.0.0.1:{ear.getsockname()[1]}"
 
 
 def test_what_was_sent_is_all_that_left_with_what_became_of_it(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    tally = SimpleNamespace(total=20, sent=11, lost=4, corrupted=3, reordered=2)
-    counts = SimpleNamespace(summary=lambda: {"lost": 9})
-    link = SimpleNamespace(
-        endpoint="udp://a:1", statuses=6, requests=5, unsent=1, link_counts=counts
-    )
-    tell_sent(tally, link, True)
-    told = json.loads(capsys.readouterr().out)
-    assert (told["packets"], told["sent"], told["lost"]) == (20, 16, 4)
-    assert (told["corrupted"], told["reordered"]) == (3, 2)
-    assert told["link"] == {"endpoint": "udp://a:1", "lost": 9}
-    tell_sent(tally, link, False)
-    words = " ".join(capsys.readouterr().err.split())
-    assert "16 packets sent (4 lost, 3 corrupted, 2 reordered, 1 unsent)" in words
-    assert "6 statuses heard, 5 time requests answered" in words
+    tally = SendTally(sent=11, lost=4, corrupted=3, reordered=2)
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ear,
+        UdpSender(heard_at(ear)) as link,
+    ):
+        link.put(b"a packet")
+        _, sender = ear.recvfrom(100)
+        for packet in (*[encode(NO_STATUS)] * 6, *[encode(TimeRequest(1, 2))] * 5):
+            ear.sendto(packet, sender)
+        wait_for(lambda: (link.statuses, link.requests) == (6, 5))
+        tell_sent(tally, link, True)
+        told = json.loads(capsys.readouterr().out)
+        tell_sent(tally, link, False)
+    counts = {"packets": 20, "sent": 16, "lost": 4, "corrupted": 3, "reordered": 2}
+    assert told == counts | {
+        "requests": 5,
+        "statuses": 6,
+        "link": {"endpoint": link.endpoint} | link.link_counts.summary(),
+    }
+    assert capsys.readouterr().err.splitlines() == [
+        "16 packets sent (4 lost, 3 corrupted, 2 reordered)",
+        "6 statuses heard, 5 time requests answered",
+    ]
 
 
 def test_a_listener_is_waited_for_in_slices_and_a_stop_ends_that() -> None:
@@ -180,11 +247,12 @@ def test_a_listener_is_waited_for_in_slices_and_a_stop_ends_that() -> None:
         slices.append(seconds)
         return len(slices) == 3
 
+    def silent(seconds: float) -> bool:
+        return False
+
     stop = threading.Event()
-    sender = SimpleNamespace(wait_for_listener=answers_third)
-    assert heard(sender, 1e6, stop, lambda seconds: None)
+    assert heard(answers_third, 1e6, stop, lambda seconds: None)
     assert len(slices) == 3
-    silent = SimpleNamespace(wait_for_listener=lambda seconds: False)
     assert not heard(silent, 0.0, stop, lambda seconds: None)
     stop.set()
     assert heard(silent, 1e6, stop, lambda seconds: None)
@@ -198,19 +266,12 @@ def test_the_angles_of_heads_are_said_pair_by_pair(
         mounted = {"tracker": {"q_body_to_cam": [1.0, 0.0, 0.0, 0.0]}}
         (tmp_path / f"{name}.toml").write_text(bench_text(mounted))
     (tmp_path / "heads.toml").write_text('heads = ["left.toml", "right.toml"]\n')
-    pairs = [
-        {
-            "heads": ["left", "right"], "fields": 4,
-            "linear_arcsec": {"rms": 0.1, "max": 0.2}, "codes_arcsec": {"rms": 0.3, "max": 0.4},
-        },
-        {"heads": ["left", "up"], "fields": 0, "linear_arcsec": None, "codes_arcsec": None},
-        {
-            "heads": ["up", "left"], "fields": 1,
-            "linear_arcsec": {"rms": 0.1, "max": 0.2}, "codes_arcsec": None,
-        },
-    ]  # fmt: skip
-    twins = [SimpleNamespace(summary=lambda pair=pair: pair) for pair in pairs]
-    asked = engine(twin_heads, "verify_heads", twins)
+    errors = [
+        HeadsErrors("left", "right", [0.1, 0.1], [0.3, 0.4]),
+        HeadsErrors("left", "up"),
+        HeadsErrors("up", "left", [0.1], []),
+    ]
+    asked = engine(twin_heads, "verify_heads", errors)
     words = ["verify", "heads.toml", "--fields", "4", "--seed", "9"]
     done = run_hilstar_here(*words, *["--json"] * as_json, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -218,44 +279,38 @@ def test_the_angles_of_heads_are_said_pair_by_pair(
     assert (list(heads.names), fields) == (["left", "right"], 4)
     assert rng.random() == np.random.default_rng(9).random()
     if as_json:
-        assert json.loads(done.stdout) == {"angles": pairs}
+        assert json.loads(done.stdout) == {"angles": [pair.summary() for pair in errors]}
     else:
         assert [" ".join(line.split()) for line in done.stdout.splitlines()] == [
-            "left to right 0.1000 / 0.2000 arcsec from linear light, 0.3000 / 0.4000 from codes"
-            " (rms / max, 4 fields)",
+            "left to right 0.1000 / 0.1000 arcsec from linear light, 0.3536 / 0.4000 from codes"
+            " (rms / max, 2 fields)",
             "left to up too few stars in both",
             "up to left too few stars in both",
         ]
 
 
-def test_a_study_s_findings_are_right_where_all_of_its_cases_are(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    cases = [
-        SimpleNamespace(
-            right=right, case="c", happens="h", why="w", method="m", fails="f"
-        )
-        for right in (True, False)
-    ]  # fmt: skip
-    finding = SimpleNamespace(figure="rapp", text="as the thesis")
-    studies = {
-        "stability": SimpleNamespace(run=lambda output: cases),
-        "models": SimpleNamespace(run=lambda output: [finding]),
-        "outputs": SimpleNamespace(run=lambda output: ["one"]),
-        "timing": SimpleNamespace(run=lambda output, quick: (["timed"], None)),
-        "limits": SimpleNamespace(run=lambda output, quick: [f"quick {quick}"]),
-    }
-    monkeypatch.setattr("hilstar.cli.study.import_module", lambda name: studies[name.split(".")[3]])
-    output = tmp_path / "out"
-    lines, right = study_lines("stability", output)
-    assert lines == ["right  c: h (w); not m: f", "WRONG  c: h (w); not m: f"]
-    assert right is False and output.is_dir()
-    del cases[1]
-    assert study_lines("stability", output)[1] is True
-    assert study_lines("models", output) == (["rapp: as the thesis"], True)
-    assert study_lines("outputs", output) == (["one"], True)
-    assert study_lines("timing", output) == (["timed"], None)
-    assert study_lines("limits", output, quick=True) == (["quick True"], True)
+def test_a_study_s_findings_are_right_where_all_of_its_cases_are() -> None:
+    right, wrong = (
+        FailureCase("c", "m", "f", "h", "w", CaseFigures(error, 2.0, tolerance=1.0))
+        for error in (1.0, 1.1)
+    )
+    lines = ["right  c: h (w); not m: f", "WRONG  c: h (w); not m: f"]
+    assert findings_of("stability", [right, wrong]) == (lines, False)
+    assert findings_of("stability", [right]) == (lines[:1], True)
+    finding = ChartFinding("rapp", "as the thesis")
+    assert findings_of("models", [finding]) == (["rapp: as the thesis"], True)
+    assert findings_of("outputs", ["one"]) == (["one"], True)
+    assert findings_of("timing", (["timed"], None)) == (["timed"], None)
+    assert findings_of("limits", ["a limit"]) == (["a limit"], True)
+
+
+@pytest.mark.parametrize("what", sorted(set(get_args(Study)) - {"chain", "confront"}))
+def test_a_study_takes_quick_where_a_part_of_it_is(what: str) -> None:
+    """`chain` and `confront` are called by their own functions."""
+    module = f"{what}.run" if what in ROOMS else what
+    run = import_module(f"hilstar.instruments.study.{module}").run
+    assert ("quick" in signature(run).parameters) is (what not in WHOLE)
+    assert (get_type_hints(run)["return"] == Judged) is (what in TIMED)
 
 
 @pytest.mark.parametrize("right", [True, False, None])
@@ -279,44 +334,27 @@ def test_a_study_of_a_chain_tells_its_scenes_what_to_do_and_whether_all_was_righ
     assert lines == ["a scene", "figures and tables in out", "write auto"]
 
 
-@pytest.mark.parametrize(("on_bench", "of_time"), [(False, "on 6 cores"), (True, "at most")])
-def test_the_costs_of_a_plan_are_those_of_its_sets_and_of_all(
-    capsys: pytest.CaptureFixture[str], on_bench: bool, of_time: str
-) -> None:
-    clauses = {"rates": ["angular rate", "lag"], "sky": ["availability"]}
+def test_the_costs_of_a_plan_are_those_of_its_sets_and_of_all() -> None:
     costs = [
-        SimpleNamespace(case_set=SimpleNamespace(name="rates"), cases=40, seconds=100.0),
-        SimpleNamespace(case_set=SimpleNamespace(name="sky"), cases=1000, seconds=8000.0),
+        (CostOfSet(CaseSet("rates", "", {}, None), 40, 100.0), ["angular rate", "lag"]),
+        (CostOfSet(CaseSet("sky", "", {}, None), 1000, 8000.0), ["availability"]),
     ]
-    workers: list[int] = []
-    acceptance = SimpleNamespace(
-        costs=lambda count: workers.append(count) or costs,
-        plan=SimpleNamespace(
-            clauses_of=lambda name: [SimpleNamespace(capability=each) for each in clauses[name]]
-        ),
-        on_bench=on_bench,
-    )
-    _print_costs(acceptance, 6, False)  # type: ignore[arg-type]
-    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
-    assert lines == [
+    told, lines = costs_table(costs, "on 6 cores")
+    assert [" ".join(line.split()) for line in lines] == [
         "rates 40 cases 100 s angular rate",
         "lag",
         "sky 1000 cases 2.2 h availability",
-        f"all 1040 cases 2.2 h {of_time}",
+        "all 1040 cases 2.2 h on 6 cores",
     ]
-    _print_costs(acceptance, 6, True)  # type: ignore[arg-type]
-    told = json.loads(capsys.readouterr().out)
-    assert (told["s"], workers) == (8100.0, [6, 6])
-    assert told["sets"][0] == {"set": "rates", "cases": 40, "s": 100.0, "clauses": clauses["rates"]}
+    rates = {"set": "rates", "cases": 40, "s": 100.0, "clauses": ["angular rate", "lag"]}
+    assert (told["s"], told["sets"][0]) == (8100.0, rates)
 
 
 def test_progress_without_a_terminal_is_a_line_each_ten_seconds_with_the_time_left(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     now_s = 1000.0
-    clock = SimpleNamespace(monotonic=lambda: now_s)
-    monkeypatch.setattr("hilstar.cli.campaign.time", clock)
-    with telling(100) as line:
+    with telling(100, lambda: now_s) as line:
         for passed_s, done in ((1.0, 20), (5.0, 30), (11.0, 40), (12.0, 41), (21.0, 60)):
             now_s = 1000.0 + passed_s
             line(done)
@@ -327,28 +365,21 @@ def test_progress_without_a_terminal_is_a_line_each_ten_seconds_with_the_time_le
     ]
 
 
-def test_a_head_gets_the_options_of_its_run_and_none_of_another_kind() -> None:
-    file = SimpleNamespace(names=["a"])
+def test_a_head_gets_the_options_of_its_run_and_none_of_another_kind(tmp_path: Path) -> None:
+    file = read_bench_or_heads(heads_file(tmp_path, 5560))
+    assert isinstance(file, HeadsFile)
     run = heads_run(
-        file,  # type: ignore[arg-type]
-        SimpleNamespace(frames=30, duration=2.5, scpi=None, bench_file=Path("heads.toml")),  # type: ignore[arg-type]
-        SimpleNamespace(headless=True, windowed=False, force=True, feed=None),  # type: ignore[arg-type]
-        SimpleNamespace(
-            ledger=Path("run.mcap"), ledger_split="1GB", scenario=Path("s.toml"), overwrite=False,
-            strict=True, explain=False,
-        ),  # type: ignore[arg-type]
-        SimpleNamespace(control=True, token="secret"),  # type: ignore[arg-type]
-    )  # fmt: skip
+        file,
+        ServeOptions(bench_file=file.path, frames=30, duration=2.5),
+        DisplayOptions(headless=True, force=True),
+        RunOptions(
+            ledger=Path("run.mcap"), ledger_split="1GB", scenario=Path("s.toml"), strict=True
+        ),
+        ActingPageOptions(control=True, token="secret"),
+    )
     words = ("--frames", "30", "--ledger-split", "1GB", "--scenario", "s.toml")
     switches = ("--headless", "--force", "--control", "--strict")
-    wanted = HeadsRun(
-        file,  # type: ignore[arg-type]
-        (*words, *switches),
-        2.5,
-        Path("run.mcap"),
-        token="secret",
-    )
-    assert run == wanted
+    assert run == HeadsRun(file, (*words, *switches), 2.5, Path("run.mcap"), token="secret")
 
 
 @pytest.mark.parametrize(
@@ -374,30 +405,13 @@ def test_the_demo_s_tracker_answers_on_this_machine_s_clock(tmp_path: Path) -> N
     assert str(config.answers.endpoint).startswith("ipc://")
 
 
-def planted_demo(folder: Path) -> TrackerBeside:
-    """The demo's tracker, which does not run."""
-    return TrackerBeside(folder, folder / "loop.toml", "ipc://answers", 30.0, 5)
-
-
 def test_the_demo_s_budget_stands_beside_what_was_planted(
-    tmp_path: Path, engine: Callable[[Any, str, Any], Engine], capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    from hilstar.server.answers.judge import TrackerFigures
-
-    axes = SimpleNamespace(cross=2.25, roll=8.5)
-    parts = SimpleNamespace(
-        bias_arcsec=np.array([19.5, -10.5, 41.0]),
-        fov_arcsec=axes,
-        pixel_arcsec=SimpleNamespace(cross=0.5, roll=None),
-    )
-    asked = engine(assessment, "assess_files", SimpleNamespace(found=parts))
-    monkeypatch.setattr("hilstar.instruments.assess.page.write_page", lambda page, found: None)
-    planted_demo(tmp_path).report(TrackerFigures(answers=200, wrong=3), True)
-    told = json.loads(capsys.readouterr().err)["loop"]
-    assert asked.given[0][0][:2] == (tmp_path / "loop.mcap", None)
-    rows = {row["quantity"]: (row["planted"], row["found"], row["unit"]) for row in told}
-    assert rows == {
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    bias_arcsec = np.array([19.5, -10.5, 41.0])
+    axes = Axes(2.25, 8.5), Axes(0.5, None)
+    rows = loop_figures(bias_arcsec, *axes, TrackerFigures(answers=200, wrong=3))
+    assert {row.quantity: (row.planted, row.found, row.unit) for row in rows} == {
         "bias x": (20.0, 19.5, "arcsec"),
         "bias y": (-10.0, -10.5, "arcsec"),
         "bias z": (40.0, 41.0, "arcsec"),
@@ -407,20 +421,37 @@ def test_the_demo_s_budget_stands_beside_what_was_planted(
         "pixel error about": (4 * PIXEL_ARCSEC, None, "arcsec"),
         "wrong answers": (100 * WRONG, 1.5, "%"),
     }
-    monkeypatch.setattr(
-        "hilstar.instruments.assess.report.lines_of", lambda found: [("bias", "20 arcsec")]
-    )
-    planted_demo(tmp_path).report(None, False)
-    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
-    assert lines[0] == "bias 20 arcsec" and "bias x 20.00 19.50 arcsec" in lines
-    assert lines[-1] == "pixel error about 2.40 unknown arcsec"  # no answers, no share of them
+    # without answers there is no share of them
+    assert loop_figures(bias_arcsec, *axes, None) == rows[:-1]
+    print_loop([("bias", "20 arcsec")], rows[5:7])
+    assert [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()] == [
+        "bias 20 arcsec",
+        "planted found",
+        "pixel error across 0.60 0.50 arcsec",
+        "pixel error about 2.40 unknown arcsec",
+    ]
+
+
+@pytest.mark.usefixtures("without_charts")
+def test_the_demo_reports_the_budget_of_its_own_ledger(
+    tmp_path: Path,
+    engine: Callable[[Any, str, Any], Engine],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    asked = engine(assessment, "assess_files", an_assessment())
+    beside = TrackerBeside(tmp_path, tmp_path / "loop.toml", "ipc://answers", 30.0, 5)
+    beside.report(None, True)
+    assert asked.given[0][0][:2] == (tmp_path / "loop.mcap", None)
+    assert (tmp_path / "budget.html").stat().st_size
+    rows = loop_figures(*[getattr(a_budget(), f"{name}_arcsec") for name in PARTS], None)
+    assert json.loads(capsys.readouterr().err) == {"loop": [row._asdict() for row in rows]}
 
 
 @pytest.mark.parametrize(("missed", "words"), [(10, ""), (11, "missed 11 frames")])
 def test_the_demo_says_where_its_budget_is_the_machine_s_too(
     capsys: pytest.CaptureFixture[str], missed: int, words: str
 ) -> None:
-    demo_command._say_missed(SimpleNamespace(frames=1000, missed_frames=missed))  # type: ignore[arg-type]
+    say_missed(missed, 1000)
     told = capsys.readouterr().err
     assert words in told and bool(told) is bool(words)
 
@@ -436,31 +467,34 @@ def edges_file(folder: Path) -> Path:
     return path
 
 
-def test_a_delay_that_is_measured_is_written_with_its_own_error(
-    tmp_path: Path, engine: Callable[[Any, str, Any], Engine]
-) -> None:
-    summary = {"panel_delay_ms": 8.25, "panel_delay_u_ms": 0.5}
-    measured = engine(by_diode, "measure_latency", summary)
-    engine(by_diode, "latency_lines", ["eight"])
-    written = engine(by_diode, "write_panel_delay", None)
-    (tmp_path / "run.mcap").write_bytes(b"")
-    words = ["latency", "run.mcap", "--edges", str(edges_file(tmp_path)), "--write", "b.toml"]
+def test_a_delay_that_is_measured_is_written_with_its_own_error(tmp_path: Path) -> None:
+    """Edges of light 8.25 ms after the swaps that caused them."""
+    square = 'photodiode_px = 40\nphotodiode = "code"\nscanout_ms = 0\n'
+    bench = SMALL_BENCH.replace("[collimator]", f"{square}[collimator]")
+    levels = np.array([marker_light(number, CODE) for number in range(120)])
+    frames_s = np.arange(120) / 60
+    write_ledger(tmp_path / "run.mcap", frames_s, None, bench=bench, markers=levels.tolist())
+    changed = np.flatnonzero(np.diff(levels)) + 1
+    seen_ns = [5 * NS_PER_S + round(t_s * NS_PER_S) + 8_250_000 for t_s in frames_s[changed]]
+    by_diode.save_edges(tmp_path / "edges.csv", Edges(np.array(seen_ns), levels[changed]))
+    (tmp_path / "b.toml").write_text(bench)
+    words = ["latency", "run.mcap", "--edges", "edges.csv", "--write", "b.toml"]
     done = run_hilstar_here(*words, "--save", "kept.csv", "-o", "out", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    (ledger, edges, output), _ = measured.given[0]
-    assert (ledger, output) == (Path("run.mcap"), Path("out"))
-    wanted_ns = [100 * k for k in range(1, EDGES + 1)]
-    assert edges.host_ns.tolist() == wanted_ns
-    assert written.given == [((Path("b.toml"), 8.25, 0.5), {})]
-    assert by_diode.read_edges(tmp_path / "kept.csv").host_ns.tolist() == wanted_ns
-    assert done.stdout == "eight\n"
+    config = read_bench_file(tmp_path / "b.toml").config
+    assert config.monitor.panel_delay_ms == 8.25
+    assert config.certify.panel_delay_u_ms == 0.0
+    assert by_diode.read_edges(tmp_path / "kept.csv").host_ns.tolist() == seen_ns
+    assert (tmp_path / "out/latency.png").exists()
+    summary = json.loads(run_hilstar_here(*words[:4], "--json", cwd=tmp_path).stdout)
+    assert summary["panel_delay_ms"] == 8.25
+    assert done.stdout.splitlines() == by_diode.latency_lines(summary)
 
 
 def test_a_camera_films_the_square_as_the_run_s_bench_file_says(
     tmp_path: Path, engine: Callable[[Any, str, Any], Engine], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from hilstar.server.genicam import camera as genicam
-    from tests.support.planted_run import write_ledger
 
     ledger = write_ledger(tmp_path / "run.mcap", np.array([0.0, 1.0]), None)
     engine(by_diode, "measure_latency", {})
@@ -526,19 +560,6 @@ def test_the_psf_of_dots_is_found_with_what_the_words_name(
     ]
 
 
-def test_what_is_given_as_an_option_of_a_run_is_an_option_of_the_real_command() -> None:
-    """The stand-ins above have the fields of the options themselves."""
-    for options, names in (
-        (ServeOptions, {"frames", "duration", "scpi", "bench_file"}),
-        (DisplayOptions, {"headless", "windowed", "force", "feed"}),
-        (RunOptions, {"ledger", "ledger_split", "scenario", "overwrite", "strict", "explain"}),
-        (ActingPageOptions, {"control", "token"}),
-        (TrackerOptions, set(vars(tracker_options()))),
-    ):
-        assert names <= set(options.__dataclass_fields__), options
-    assert math.isfinite(WRONG)
-
-
 @pytest.mark.parametrize(
     ("what", "given", "words"),
     [
@@ -560,10 +581,10 @@ def test_a_study_takes_what_it_uses_and_nothing_else(
     what: str, given: dict[str, Any], words: str | None
 ) -> None:
     known = dict.fromkeys(("bench", "images", "radec", "star")) | given
-    options = SimpleNamespace(what=what, bench=known["bench"], images=known["images"])
-    pointing = SimpleNamespace(radec=known["radec"], star=known["star"])
+    options = StudyOptions(what=what, output=Path(), bench=known["bench"], images=known["images"])
+    pointing = FieldOptions(radec=known["radec"], star=known["star"])
     if words is None:
-        refuse_unused(options, pointing)  # type: ignore[arg-type]
+        refuse_unused(options, pointing)
     else:
         assert words in refusal(refuse_unused, options, pointing)
 
@@ -604,43 +625,45 @@ def test_a_cluster_has_its_own_workers(
     key: Path | None,
     words: str | None,
 ) -> None:
-    options = SimpleNamespace(
-        scheduler=scheduler, memory=memory, tls_ca_file=None, tls_cert=None, tls_key=key
+    options = CampaignOptions(
+        plan=Path(), output=Path(), scheduler=scheduler, memory=memory, tls_key=key
     )
-    cases = SimpleNamespace(workers=workers)
+    cases = CaseOptions(workers=workers)
     if words is None:
-        assert _scheduler(options, cases) is None  # type: ignore[arg-type]
+        assert _scheduler(options, cases) is None
     else:
         assert words in refusal(_scheduler, options, cases)
 
 
-@pytest.mark.parametrize(
-    ("verdict", "words", "code"),
-    [
-        (NOT_MET, [], 0),
-        (NOT_MET, ["--strict"], 1),
-        ("met", ["--strict"], 0),
-        ("not shown", ["--strict"], 0),
-    ],
-)
-def test_an_acceptance_that_is_not_met_is_an_error_where_that_is_asked_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verdict: str, words: list[str], code: int
-) -> None:
-    accepted = SimpleNamespace(
-        on_bench=False,
-        check=lambda: None,
-        run=lambda missing: [],
-        verdicts=lambda results: [verdict],
-    )
-    monkeypatch.setattr(acceptance_plan, "read_acceptance_plan", lambda *_: None)
-    monkeypatch.setattr(acceptance_engine, "Acceptance", lambda *_: accepted)
-    monkeypatch.setattr(acceptance_engine, "write_ledger", lambda path, results: 0)
-    monkeypatch.setattr(acceptance_page, "write_acceptance", lambda *_: {})
-    monkeypatch.setattr(acceptance_page, "lines_of", lambda *_: ["a line"])
-    monkeypatch.setattr(acceptance_page, "verdict_of", lambda verdicts: verdicts[0])
-    done = run_hilstar_here("accept", "bench.toml", "-o", "out", *words, cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (code, "")
-    assert done.stdout.splitlines()[0] == "a line"
+ACCEPTED = """
+[[clause]]
+capability = "noise"
+quantity = "nea"
+axis = "cross"
+of = "lost"
+maximum = {maximum_arcsec}
+[cases.lost]
+cases = 4
+frames = 4
+"""
+
+
+def test_an_acceptance_that_is_not_met_is_an_error_where_that_is_asked_for(tmp_path: Path) -> None:
+    """Of cases that stand in its directory."""
+    accepted(tmp_path, ACCEPTED.format(maximum_arcsec=1e6))
+    for maximum_arcsec, words, verdict, code in (
+        (1e6, ["--strict"], "met", 0),
+        (1e-6, [], NOT_MET, 0),
+        (1e-6, ["--strict"], NOT_MET, 1),
+        (0.3, ["--strict"], "not shown", 0),
+    ):
+        (tmp_path / "plan.toml").write_text(ACCEPTED.format(maximum_arcsec=maximum_arcsec))
+        asked = ("accept", "bench.toml", "--plan", "plan.toml", "-o", "out")
+        done = run_hilstar_here(*asked, *words, cwd=tmp_path)
+        assert (done.returncode, done.stderr) == (code, "")
+        line, page = done.stdout.splitlines()
+        assert line.startswith(f"noise  {verdict:12}at most")
+        assert page == "page  out/accept.html"
 
 
 def test_an_acceptance_s_sets_are_run_by_one_pool_that_turns_to_each(

@@ -34,7 +34,7 @@ from hilstar.instruments.verify.summary import verify as run_twin
 from hilstar.instruments.verify.verdict import Verdict as TwinVerdict
 from hilstar.instruments.verify.verdict import judge
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import open_bench
+from hilstar.server.bench.build import full_scale_e_per_s
 from hilstar.server.bench.cameras import bench_camera, display_psf
 from hilstar.server.bench.config import Verify
 from hilstar.server.bench.monitor import calibration_source
@@ -256,7 +256,7 @@ def _twin_file(context: StepContext) -> BenchFile:
     known = Verify(
         **limits,
         true_calibration=str(calibration_source(monitor, folder)),
-        true_flux_at_white_e_per_s=_white_e_per_s(truth),
+        true_flux_at_white_e_per_s=full_scale_e_per_s(truth),
     )
     if collimator.geometry is not None:
         known = replace(known, true_geometry=str(folder / collimator.geometry))
@@ -373,7 +373,7 @@ def _directions(file: BenchFile, x_px: FloatArray, y_px: FloatArray) -> FloatArr
 def scale(context: StepContext) -> StepOutcome:
     """Find what white is worth by stars, and set it in the bench file. Raises InputError."""
     stars_seen = see_stars(context)
-    white = _white_e_per_s(context.file)
+    white = full_scale_e_per_s(context.file)
     drawn = display_psf(context.file.config, context.file.folder, context.geometry().monitor)
     clips = stars_seen.e_per_s * drawn.peak_share > white
     used = (stars_seen.noise_mag < READ_MAG) & ~clips
@@ -406,7 +406,7 @@ def scale(context: StepContext) -> StepOutcome:
         "stars": len(ratios),
     }
     if context.truth is not None:
-        figures["truth_off_mag"] = magnitude(found_white / _white_e_per_s(context.truth))
+        figures["truth_off_mag"] = magnitude(found_white / full_scale_e_per_s(context.truth))
     figures["scatter_error_mag"] = scatter.error_mag
     direction = "fainter" if off_mag > 0 else "brighter"
     line = (
@@ -498,11 +498,6 @@ def _contradictions(
             f" {trend_error_mag:.3f} mag"
         )
     return contradictions
-
-
-def _white_e_per_s(file: BenchFile) -> float:
-    with open_bench(file) as bench:
-        return bench.flux_at_white_e_per_s
 
 
 def trend(

@@ -14,7 +14,7 @@ import pytest
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from hilstar.basics import charts, pages
+from hilstar.basics import charts
 from hilstar.basics.arrays import FloatArray
 from hilstar.instruments.assess import report
 from hilstar.instruments.assess.assessment import AssessSettings, assess_files, lock_of
@@ -52,7 +52,8 @@ def by_file(
     """
     folder, drawn = tmp_path_factory.mktemp("assess"), []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pages, "svg", lambda figure: drawn.append(figure) or charts.svg(figure))
+        svg = charts.svg
+        patch.setattr(charts, "svg", lambda figure: drawn.append(figure) or svg(figure))
         ledger, telemetry = write_run(folder, planted)
         run = run_hilstar_here(
             "assess", ledger, telemetry, "-o", folder / "out", "--json", "--display-attitudes", "0"
@@ -185,6 +186,7 @@ def test_a_ledgers_own_answers_give_the_budget_of_a_file_of_them(
     )
 
 
+@pytest.mark.usefixtures("without_charts")
 def test_a_bench_with_a_glass_is_told_what_each_correction_would_leave(tmp_path: Path) -> None:
     """By the file of the PSF: lateral colour and coma in closed form, most of which a distortion
     takes, and colour besides.
@@ -427,6 +429,7 @@ def test_slices_by_rate_show_where_the_noise_grows() -> None:
 
 
 REFRESH_HZ, EXPOSURE_S, NOISE_ARCSEC = 60.0, 0.1, 2.0
+LATENCY_S = 0.3  # from an exposure's middle on: all frames that it has are shown by then
 BENCH_60_HZ = bench_text(
     {"monitor": {"refresh_hz": REFRESH_HZ}, "tracker": {"exposure_s": EXPOSURE_S}}
 )
@@ -459,13 +462,16 @@ def missing_run(
     ledger = write_ledger(
         folder / "run.mcap", frames_s, frames_q, bench=BENCH_60_HZ, missed_before=before.tolist()
     )
-    frames = LitFrames(1e9 / REFRESH_HZ / 1000)  # so that none is forgotten
-    frames._early_ns = round(0.5e9 / REFRESH_HZ)
-    for number, (t_s, q) in enumerate(zip(frames_s.tolist(), frames_q, strict=True)):
-        frames.add(LitFrame(number, round(t_s * 1e9), round(t_s * 1e9), q))
+    frames, to_come = (
+        LitFrames(1e9 / REFRESH_HZ),
+        iter(zip(frames_s.tolist(), frames_q, strict=True)),
+    )
     at_s, reported = [], []
     for t_s in np.arange(1.0, seconds - 1.0, 0.2).tolist():
         half_s = EXPOSURE_S / 2
+        while frames.newest is None or frames.newest.host_ns < (t_s + LATENCY_S) * 1e9:
+            shown_s, q = next(to_come)
+            frames.add(LitFrame(0, round(shown_s * 1e9), round(shown_s * 1e9), q))
         lit = frames.over(round((t_s - half_s) * 1e9), round((t_s + half_s) * 1e9))
         if lit is not None:
             at_s.append(t_s)
@@ -481,7 +487,7 @@ def missing_run(
     return ledger, write_telemetry(folder / "telemetry.csv", np.array(at_s), answers), wild_rows
 
 
-@pytest.mark.parametrize(("missed", "seed"), [(67, 1), (200, 2), (405, 3)])
+@pytest.mark.parametrize(("missed", "seed"), [(67, 1), (405, 3)])
 def test_missed_frames_are_not_the_trackers_errors(tmp_path: Path, missed: int, seed: int) -> None:
     ledger, telemetry, wild = missing_run(tmp_path, missed, seed, wild=4)
     found, _ = budget(ledger, telemetry)
@@ -498,6 +504,7 @@ def test_missed_frames_are_not_the_trackers_errors(tmp_path: Path, missed: int, 
     assert found["availability"] == pytest.approx(1 - len(wild) / rows, abs=0.01)
 
 
+@pytest.mark.usefixtures("without_charts")
 def test_missed_frames_are_named_on_the_terminal_and_on_the_page(tmp_path: Path) -> None:
     ledger, telemetry, _ = missing_run(tmp_path, 30, 4, seconds=60.0)
     run = run_hilstar_here(
@@ -555,24 +562,28 @@ def own_answers(planted: Planted, share: float, seed: int = 6) -> list[AnswerRec
     return sorted(records, key=lambda each: each.host_ns)
 
 
-@pytest.mark.parametrize("share", [0.01, 0.05])
 def test_answers_out_of_order_give_the_budget_of_those_in_order(
-    tmp_path: Path, planted: Planted, share: float
+    tmp_path: Path, planted: Planted
 ) -> None:
-    ordered = write_ledger(
-        tmp_path / "a.mcap", planted.frames_s, planted.frames_q, records=own_answers(planted, 0.0)
-    )
-    overtaken = write_ledger(
-        tmp_path / "b.mcap", planted.frames_s, planted.frames_q, records=own_answers(planted, share)
-    )
-    (first, _), (second, notes) = budget(ordered), budget(overtaken)
-    assert first["out_of_order"] == 0
-    assert second["out_of_order"] == pytest.approx(share * len(planted.tau_s), rel=0.5)
-    assert len(second["wrong"]) == len(first["wrong"]) == 5
-    for key in ("bias_arcsec", "noise_arcsec", "fov_arcsec", "availability"):
-        assert second[key] == pytest.approx(first[key], rel=1e-6)
-    assert second["clock"]["drift_ppm"] == pytest.approx(first["clock"]["drift_ppm"], abs=1e-3)
-    assert not any("clock was set" in note for note in notes)
+    shares, budgets = (0.0, 0.01, 0.05), []
+    for share in shares:
+        ledger = write_ledger(
+            tmp_path / f"{share}.mcap",
+            planted.frames_s,
+            planted.frames_q,
+            records=own_answers(planted, share),
+        )
+        found, notes = budget(ledger)
+        budgets.append(found)
+        assert found["out_of_order"] == pytest.approx(share * len(planted.tau_s), rel=0.5)
+        assert len(found["wrong"]) == 5
+        assert not any("clock was set" in note for note in notes)
+    in_order, *others = budgets
+    for found in others:
+        for key in ("bias_arcsec", "noise_arcsec", "fov_arcsec", "availability"):
+            assert found[key] == pytest.approx(in_order[key], rel=1e-6)
+        drift_ppm = in_order["clock"]["drift_ppm"]
+        assert found["clock"]["drift_ppm"] == pytest.approx(drift_ppm, abs=1e-3)
 
 
 def test_a_trackers_clock_that_was_set_is_said_and_arrivals_count(

@@ -360,6 +360,7 @@ def test_the_newest_image_of_the_virtual_bench_is_its_file(tmp_path):
         assert (kept == read).all()
 
 
+@pytest.mark.usefixtures("without_charts")
 def test_bit_stealing_needs_the_primaries_and_finds_their_shares(tmp_path):
     """Three channels of their own powers and shares of white: a triple's light is right only
     when all six are.

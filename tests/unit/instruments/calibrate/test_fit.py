@@ -60,8 +60,7 @@ def curve_errors(fit, curve):
     return (fit.light / np.where(true > 0, true, 1) - 1)[true >= FAINTEST]
 
 
-@pytest.mark.parametrize("bits", [8, 10])
-@pytest.mark.parametrize("black", [0.0, 1e-3])
+@pytest.mark.parametrize(("bits", "black"), [(8, 0.0), (10, 1e-3)])
 @pytest.mark.parametrize("name", CURVES)
 def test_a_response_is_recovered_to_one_percent_over_three_decades(name, black, bits, tmp_path):
     """3 repeats do where a formula fits; a shape of its own has twice the free parameters, and is

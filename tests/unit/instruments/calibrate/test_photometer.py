@@ -26,7 +26,7 @@ from hilstar.instruments.calibrate.first_light.image_sources import VirtualBench
 from hilstar.instruments.calibrate.first_light.photometer import monitor_area
 from hilstar.instruments.calibrate.first_light.photometry import photometry
 from hilstar.instruments.calibrate.measurements import read_measurements
-from hilstar.instruments.calibrate.photometric import calibrate_photometric, fit_channel
+from hilstar.instruments.calibrate.photometric import fit_channel
 from hilstar.instruments.calibrate.plan import PlanSettings, plan_patches
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.server.bench.bench_file import read_bench_file
@@ -50,8 +50,8 @@ EVEN_ERROR = 0.001  # of the map of it, relative
 SURE = 4.0  # sigmas: one figure in 16 000 is further off
 # of sums of 200 terms of order 1, and of sines of 8 x 40 turns, in double precision
 ROUNDING_DN = 1e-12
-# Root mean square of figures in their sigmas: 1 for honest errors. 12 figures give it to a fifth,
-# three times.
+# Root mean square of figures in their sigmas: 1 for honest errors. 6 figures give it to 0.29,
+# twice.
 MAX_RMS = 1.6
 NOISY = {
     "gain_e_per_dn": 8.0,
@@ -113,7 +113,7 @@ def test_a_response_and_its_black_level_are_as_far_off_as_their_errors_say(detec
     """
     power_law_bench(tmp_path, detector)
     off, black = [], []
-    for seed in range(4):
+    for seed in range(2):
         _, response, level = measured_light(tmp_path, seed)
         off.append(response)
         black.append(level)
@@ -179,21 +179,6 @@ def test_what_rounding_takes_of_codes_that_cannot_be_exposed_longer_is_in_their_
     assert abs(black) < SURE
     # Half a step of the ADC, of codes whose peak is a few steps.
     assert float(outcome.figures["error_at_1e-3_percent"]) > 1.0
-
-
-def test_the_command_and_the_step_give_the_same_figures(tmp_path):
-    power_law_bench(tmp_path, NOISY)
-    outcome, _, _ = measured_light(tmp_path, 0)
-    found = calibrate_photometric(tmp_path / "measured.csv", tmp_path / "again.toml", bits=BITS)
-    mine, its = (read_toml(tmp_path / name).errors for name in ("response.toml", "again.toml"))
-    assert mine == its
-    assert found["holdout"]["rms_mag"] == outcome.figures["held_out_rms_mag"]
-    assert found["black_level"]["relative"] == pytest.approx(outcome.figures["black_level"])
-    responses = [
-        load_calibration(tmp_path / name, BITS).response.light
-        for name in ("response.toml", "again.toml")
-    ]
-    assert np.array_equal(*responses)
 
 
 def test_a_cause_that_readings_share_is_in_the_error_of_the_response(tmp_path):

@@ -7,9 +7,11 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -35,6 +37,8 @@ from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.planted_certify import (
     BENCH,
     LIGHT,
+    PARTS,
+    PLACE,
     REGIONS,
     coverage,
     coverage_by_images,
@@ -58,8 +62,8 @@ from tests.support.planted_run import write_run
 from tests.support.planted_tracker import Planted, Sizes, scan
 from tests.support.planted_tracker import plant as plant_tracker
 
-BENCHES = 40
-FAR = 4 * math.sqrt(0.05 * 0.95 / BENCHES)  # the figures of one bench's third go nearly together
+BENCHES = 24
+FAR = 3 * math.sqrt(0.05 * 0.95 / BENCHES)  # the figures of one bench's third go nearly together
 UNCHANGED = 20
 FEW = 8
 # of figures that go together in each of FEW benches
@@ -98,10 +102,6 @@ HARD: dict[str, tuple[Callable[[np.random.Generator], Truth], tuple[str, ...]]] 
         lambda rng: dots_in_place(rng, 60, 0.5),
         ("place_along", "place_across", "attitude_x", "attitude_y"),
     ),
-    "dots over 200 px": (
-        lambda rng: dots_in_place(rng, 200, 0.5),
-        ("place_along", "place_across", "attitude_x", "attitude_y"),
-    ),
     # The polynomials beside the lens follow it: by what they leave intervals held 60 %.
     "few of dots' errors over 280 px": (
         lambda rng: dots_in_place(rng, 280, 0.03),
@@ -114,7 +114,8 @@ HARD: dict[str, tuple[Callable[[np.random.Generator], Truth], tuple[str, ...]]] 
 @pytest.mark.parametrize("kind", HARD)
 def test_intervals_hold_the_truth_of_benches_whose_errors_correlate(kind: str) -> None:
     draw, moved = HARD[kind]
-    held = coverage(draw, FEW, 3)
+    parts = tuple(part for part, told in PARTS.items() if set(told) & set(moved))
+    held = coverage(draw, FEW, 3, parts=parts)
     for (quantity, region), counted in held.items():
         if quantity in moved:
             assert np.mean(counted.held) > MIN_HELD, (quantity, region)
@@ -127,9 +128,8 @@ def test_codes_that_are_off_by_themselves_widen_the_response_between_those_read(
         light = one.light * (1 + 0.005 * rng.standard_normal(256))
         return replace(one, light=light / light[-1])
 
-    for (quantity, region), counted in coverage(rough, FEW, 4).items():
-        if quantity == "flux":
-            assert np.mean(counted.held) > MIN_HELD, region
+    for where, counted in coverage(rough, FEW, 4, parts=(LIGHT,)).items():
+        assert np.mean(counted.held) > MIN_HELD, where
 
 
 def test_pixels_that_change_each_others_light_widen_flux_by_what_a_lattice_shows() -> None:
@@ -146,12 +146,13 @@ def test_pixels_that_change_each_others_light_widen_flux_by_what_a_lattice_shows
 
 def test_places_seen_through_an_unstated_lens_are_not_assessed_and_a_stated_one_counts() -> None:
     own_lens = KINDS["tracker's own lens"]
-    unstated = coverage(own_lens, 2, 5, tables="")
+    unstated = coverage(own_lens, 1, 5, tables="")
     assert {where for where, counted in unstated.items() if not counted.held} == {
         *((f"place_{axis}", region) for axis in ("along", "across") for region in REGIONS),
         *((f"attitude_{axis}", "field") for axis in "xyz"),
     }
-    for where, counted in coverage(own_lens, FEW, 5, tables=stated_lens()).items():
+    stated = coverage(own_lens, FEW, 5, tables=stated_lens(), parts=(PLACE,))
+    for where, counted in stated.items():
         assert np.mean(counted.held) > MIN_HELD, where
 
 
@@ -445,19 +446,43 @@ def test_a_check_is_quiet_where_nothing_moved(checked) -> None:
         )
 
 
-def test_the_command_certifies_checks_and_refuses(tmp_path) -> None:
-    bench, truth = plant(
-        tmp_path,
-        drawn(np.random.default_rng(5)),
-        '[certify]\nfields = 1\nmax_latency_ms = 1.0\nwho = "A. Tester"\n' + DIRECTION,
-    )
-    words = ["certify", str(bench), "-o", str(tmp_path / "out"), "--virtual", str(truth)]
-    done = run_hilstar_here(*words, "--quick", "--json")
-    found = msgspec.json.decode(done.stdout)
-    assert done.returncode == 0
-    assert found["conforms"] is False  # the bench file's delay is 8 ms, the truth's is not
-    assert found["who"] == "A. Tester"
-    figure = next(each for each in found["figures"] if each["quantity"] == "latency")
+CUBE = """
+[alignment]
+q_mon_to_reference = [1.0, 0.0, 0.0, 0.0]
+covariance_arcsec2 = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 4.0]]
+name = "cube 7"
+"""
+KEYS = f'[certify]\nfields = 1\nmax_latency_ms = 1.0\nwho = "A. Tester"\n{DIRECTION}{CUBE}'
+
+
+@pytest.fixture
+def certified(tmp_path: Path, certified_once: tuple[Path, dict[str, Any]]) -> dict[str, Any]:
+    """What the command said of a planted bench, whose folder, out/ beside it, this test has for
+    its own.
+    """
+    folder, said = certified_once
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    return said
+
+
+@pytest.fixture(scope="module")
+def certified_once(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    folder = tmp_path_factory.mktemp("certified")
+    plant(folder, drawn(np.random.default_rng(5)), KEYS)
+    done = run_hilstar_here(*CERTIFY, "--quick", "--json", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    return folder, msgspec.json.decode(done.stdout)
+
+
+CERTIFY = ("certify", "bench.toml", "-o", "out", "--virtual", "truth.toml")
+
+
+def test_the_command_certifies_checks_and_refuses(
+    tmp_path: Path, certified: dict[str, Any]
+) -> None:
+    assert certified["conforms"] is False  # the bench file's delay is 8 ms, the truth's is not
+    assert certified["who"] == "A. Tester"
+    figure = next(each for each in certified["figures"] if each["quantity"] == "latency")
     assert figure["lower"] < figure["value"] < figure["upper"]
     assert figure["contributions"][0]["input"] == "delay"
     page = (tmp_path / "out" / "index.html").read_text()
@@ -467,71 +492,41 @@ def test_the_command_certifies_checks_and_refuses(tmp_path) -> None:
     assert ">-</td>" not in page and ">unlimited</td>" not in page
     assert "place_along" not in page and "psf_sigma" not in page and "{}" not in page
     assert "collimator: quaternion cam to mon</th><td>1, 0, 0, 0</td>" in page
-    assert run_hilstar_here(*words).returncode == 2
-    assert run_hilstar_here(*words, "--check").returncode == 0
-    plant(tmp_path, dataclasses.replace(drawn(np.random.default_rng(5)), white=1e6))
-    moved = run_hilstar_here(*words, "--check", "--json")
+    assert "Cube to tracker&#x27;s boresight" in page and "of cube 7, within" in page
+    assert run_hilstar_here(*CERTIFY, cwd=tmp_path).returncode == 2
+    assert run_hilstar_here(*CERTIFY, "--check", cwd=tmp_path).returncode == 0
+    plant(tmp_path, dataclasses.replace(drawn(np.random.default_rng(5)), white=1e6), KEYS)
+    moved = run_hilstar_here(*CERTIFY, "--check", "--json", cwd=tmp_path)
     assert moved.returncode == 1
     assert msgspec.json.decode(moved.stdout)["checks"] == 2
-    again = msgspec.json.decode(run_hilstar_here(*words, "--again", "--quick", "--json").stdout)
-    assert again["replaces"] == found["number"]
+    done = run_hilstar_here(*CERTIFY, "--again", "--quick", "--json", cwd=tmp_path)
+    again = msgspec.json.decode(done.stdout)
+    assert again["replaces"] == certified["number"]
     assert "drift" in {each["name"] for each in again["inputs"]}  # by the checks between
 
 
-CUBE = """
-[alignment]
-q_mon_to_reference = [1.0, 0.0, 0.0, 0.0]
-covariance_arcsec2 = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 4.0]]
-name = "cube 7"
-"""
-
-
 @pytest.mark.usefixtures("without_charts")
-def test_runs_frames_and_assessments_name_the_certificate(tmp_path, planted_run: Planted) -> None:
-    bench, truth = plant(
-        tmp_path, drawn(np.random.default_rng(5)), "[certify]\nfields = 1\n" + DIRECTION + CUBE
-    )
-    words = ("certify", bench, "-o", tmp_path / "out", "--virtual", truth, "--quick", "--json")
-    number = msgspec.json.decode(run_hilstar_here(*words).stdout)["number"]
-    page = (tmp_path / "out" / "index.html").read_text()
-    assert "Cube to tracker&#x27;s boresight" in page and "of cube 7, within" in page
-    bench.write_text(
-        bench.read_text().replace("fields = 1", 'fields = 1\ncertificate = "out/certificate.json"')
-    )
-    assert (
-        run_hilstar_here("frame", bench, "--radec", "84,-1,0", "-o", tmp_path / "a.fits").returncode
-        == 0
-    )
+def test_runs_frames_and_assessments_name_the_certificate(
+    tmp_path: Path, certified: dict[str, Any], planted_run: Planted
+) -> None:
+    number, bench = certified["number"], tmp_path / "bench.toml"
+    named = 'fields = 1\ncertificate = "out/certificate.json"'
+    bench.write_text(bench.read_text().replace("fields = 1", named))
+    frame = ("frame", bench, "--radec", "84,-1,0", "-o")
+    assert run_hilstar_here(*frame, tmp_path / "a.fits").returncode == 0
     assert fits.getheader(tmp_path / "a.fits")["CERTIF"] == number
     (tmp_path / "log.csv").write_text("t_s,qw,qx,qy,qz\n0.0,1,0,0,0\n0.1,1,0,0,0\n")
-    words = (
-        "replay",
-        bench,
-        tmp_path / "log.csv",
-        "--headless",
-        "--speed",
-        "max",
-        "--ledger",
-        tmp_path / "run.mcap",
-    )
-    assert run_hilstar_here(*words).returncode == 0
+    words = ("replay", "bench.toml", "log.csv", "--headless", "--speed", "max")
+    done = run_hilstar_here(*words, "--ledger", "run.mcap", cwd=tmp_path)
+    assert done.returncode == 0
     assert read_head(tmp_path / "run.mcap")["certificate"] == number
+    certificate = {"certificate": str(tmp_path / "out/certificate.json")}
     ledger, telemetry = write_run(
-        tmp_path,
-        planted_run,
-        bench_text({"certify": {"certificate": str(tmp_path / "out/certificate.json")}}) + CUBE,
+        tmp_path, planted_run, bench_text({"certify": certificate}) + CUBE
     )
-    words = (
-        "assess",
-        ledger,
-        telemetry,
-        "-o",
-        tmp_path / "assessed",
-        "--json",
-        "--display-attitudes",
-        "0",
-    )
-    told = msgspec.json.decode(run_hilstar_here(*words).stdout)
+    words = ("assess", ledger, telemetry, "-o", tmp_path / "assessed", "--json")
+    done = run_hilstar_here(*words, "--display-attitudes", "0")
+    told = msgspec.json.decode(done.stdout)
     assert told["cube_to_boresight"]["reference"] == "cube 7"
     # what the certificate does not know, the cube's direction cannot be known to
     assert told["cube_to_boresight"]["cross_arcsec"] > told["bench"]["off_arcsec"]["cross"]
@@ -540,15 +535,10 @@ def test_runs_frames_and_assessments_name_the_certificate(tmp_path, planted_run:
     assert 0 < part["share_of_bias"]["cross"] <= 1
     assert "could have made" in (tmp_path / "assessed" / "budget.html").read_text()
     (tmp_path / "out" / "certificate.json").write_text("{}")
-    assert_refused(
-        run_hilstar_here("frame", bench, "--radec", "84,-1,0", "-o", tmp_path / "b.fits"),
-        2,
-        "is no certificate",
-    )
+    assert_refused(run_hilstar_here(*frame, tmp_path / "b.fits"), 2, "is no certificate")
 
 
 @pytest.fixture(scope="module")
 def planted_run() -> Planted:
-    return plant_tracker(
-        scan, Sizes(wild=5, offset_s=0.02), np.random.default_rng(11), seconds=60.0
-    )
+    sizes = Sizes(wild=5, offset_s=0.02)
+    return plant_tracker(scan, sizes, np.random.default_rng(11), seconds=60.0)

@@ -19,12 +19,12 @@ from hilstar.instruments.certify.bench_readings import (
     BesideRatio,
     geometry_of,
     grey_response,
-    white_of,
 )
 from hilstar.instruments.certify.readings import VirtualReader, dot_places, dot_settings
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.optics.camera import Camera
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
+from hilstar.server.bench.build import full_scale_e_per_s
 from tests.support.planted_certify import BENCH
 
 QUIET = """[certify.virtual]
@@ -77,7 +77,7 @@ def test_light_is_that_of_the_code_at_the_middle_as_the_screen_warms_and_drifts(
     x_px, y_px = np.meshgrid(np.arange(1920), np.arange(1080))
     brightest = even_at(x_px[::8].ravel(), y_px[::8].ravel()).max()  # the screen's, at its corner
     scale = even_at(np.array([960]), np.array([540])) / brightest
-    wanted_white = 1.01 * white_of(truth) * scale
+    wanted_white = 1.01 * full_scale_e_per_s(truth) * scale
     for begun_s in (0.0, 28.0, 656.0):
         read = reader.light(codes)
         t_s = begun_s + 7.0 * np.arange(4)

@@ -107,14 +107,21 @@ def test_an_unchanged_frame_is_the_same_sky(scene):
     assert summary["stars"] + blended + summary["unmeasured"] == len(scene.golden.truth)
 
 
-@pytest.mark.parametrize("sky", SKIES)
-@pytest.mark.parametrize("ra_dec", [(84.057, -1.2), (101.29, -16.7), (56.7, 24.1), (266.0, -29.0)])
-def test_another_driver_s_rounding_passes(benches, sky, ra_dec):
-    """GL's float32 against the oracle's float64: the belt, Sirius, the Pleiades, the Milky Way
-    with 680 stars in 320 x 240.
-    """
+PLACES = {
+    "belt": (84.057, -1.2),
+    "Sirius": (101.29, -16.7),
+    "Pleiades": (56.7, 24.1),
+    "Milky Way": (266.0, -29.0),  # 680 faint stars in 320 x 240
+}
+DRAWN = [("default", "belt"), ("default", "Sirius"), ("default", "Pleiades")]
+DRAWN += [("faint stars", "belt"), ("faint stars", "Milky Way"), ("wide", "Milky Way")]
+
+
+@pytest.mark.parametrize(("sky", "place"), DRAWN)
+def test_another_driver_s_rounding_passes(benches, sky, place):
+    """GL's float32 against the oracle's float64."""
     bench = benches[sky]
-    scene = Field(bench, from_radec_roll_deg(*ra_dec, 0.0))
+    scene = Field(bench, from_radec_roll_deg(*PLACES[place], 0.0))
     oracle = linear_image(scene.sprites, bench.camera.resolution_px, bench.psf)
     for one, other in (
         (scene.golden, oracle),

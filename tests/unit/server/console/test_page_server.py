@@ -50,6 +50,7 @@ from hilstar.server.console.protocol import (
     SkyPlace,
     WrongCondition,
 )
+from hilstar.server.console.server import __main__ as main
 from hilstar.server.console.server import app
 from hilstar.server.console.server.__main__ import OrderChannel, run
 from tests.support.pages import PageAddress, live, picture_of
@@ -377,6 +378,19 @@ def test_a_page_that_wants_pictures_makes_the_run_copy_them_and_gets_them():
             assert (form["frame"], shown.tolist()) == (70, LEVELS.tolist())
             link.want(picture=False)
             wait_for(lambda: page.memory.want.each_ns == 0)
+
+
+def test_pages_that_do_not_read_are_closed_and_who_reads_stays(monkeypatch):
+    """Pings that nobody answers end a connection after PONG_S."""
+    monkeypatch.setattr(main, "PING_S", 0.1)
+    monkeypatch.setattr(main, "PONG_S", 0.5)
+    with served() as page, contextlib.ExitStack() as stack:
+        own = {"Origin": f"http://127.0.0.1:{page.address.port}"}
+        for _ in range(4):
+            stack.enter_context(live(page.address, own)).want(picture=True, hz=10)
+        with live(page.address, own) as link:
+            link.await_message(lambda _: metrics(page)["console_clients"] == 5)
+            link.await_message(lambda _: metrics(page)["console_clients"] == 1)
 
 
 def test_scpi_is_served_beside_the_page():

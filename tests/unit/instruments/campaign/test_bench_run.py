@@ -28,6 +28,7 @@ from hilstar.server.answers.answer import Answer, ReportedStar
 from hilstar.server.answers.judge import AnswerJudge, AnswerRules
 from hilstar.server.answers.pairing import LitFrames
 from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.operator import OnScreen
 from hilstar.server.pacer import Shown
 from tests.support.campaigns import write_campaign
 
@@ -249,10 +250,10 @@ def test_a_case_begins_with_the_light_of_its_first_frame_on_a_screen_after_its_s
 
 def test_a_frame_that_an_operator_changed_begins_no_case(cases):
     cases.begin(0)
-    on_screen = SimpleNamespace(operator=True, hidden=False)
+    on_screen = OnScreen(operator="grid")
     cases.run._lit(lit_at(cases, START_NS, True, on_screen=on_screen))
     assert cases.run._now.begun_ns is None
-    on_screen = SimpleNamespace(operator=False, hidden=True)
+    on_screen = OnScreen(hidden="minimised")
     cases.run._lit(lit_at(cases, START_NS, True, on_screen=on_screen))
     assert cases.run._now.begun_ns is None
 

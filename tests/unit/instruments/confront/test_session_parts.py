@@ -19,7 +19,12 @@ from hilstar.basics.rotation import from_matrix
 from hilstar.instruments.confront import run as confront_run
 from hilstar.instruments.confront import session as sessions
 from hilstar.instruments.confront import star_psf
-from hilstar.instruments.confront.background import FixedPattern, FoundSources, SkyLevel
+from hilstar.instruments.confront.background import (
+    FixedPattern,
+    FoundSources,
+    SkyLevel,
+    sky_level,
+)
 from hilstar.instruments.confront.camera_fit import CameraFit, Pointing
 from hilstar.instruments.confront.images import Photograph, _planes
 from hilstar.instruments.confront.light import LightFit
@@ -151,17 +156,17 @@ def test_places_reach_as_far_as_95_percent_of_them_from_the_principal_point():
         assert sessions._largest_reach_px(CAMERA, photographs) == pytest.approx(190.0)
 
 
-def test_levels_of_a_power_are_light_again_and_full_scale_stays(monkeypatch):
-    monkeypatch.setattr(sessions, "sky_level", lambda dn, step_dn: ("level", step_dn))
+def test_levels_of_a_power_are_light_again_and_full_scale_stays():
     power = 0.5
-    light = np.array([[0.0, 0.01, 0.01], [0.01, 0.25, 1.0]])
+    light = np.full((40, 60), 0.01)
+    light[7, 9:12] = [0.0, 0.25, 1.0]
     coded = photograph(4095 * light**power, step_dn=2.0)
-    shot = sessions.Shot(coded, None, None, None, None, 1.0, None, np.empty(0))
-    linear = _linear(shot, coded, power)
+    linear = _linear(a_shot(0), coded, power)
     np.testing.assert_allclose(linear.photo.dn, 4095 * light)
     # d(light) / d(code) at the sky's: light = code^2, and its code is a tenth
     assert linear.photo.step_dn == pytest.approx(2.0 * 2 * 0.1)
-    assert linear.level == ("level", linear.photo.step_dn)
+    wanted = sky_level(4095 * light, 2.0 * 2 * 0.1)
+    np.testing.assert_allclose(linear.level.level, wanted.level)
 
 
 def test_an_efficiency_bends_about_550_nm_by_squares_of_the_logarithm():

@@ -384,8 +384,11 @@ def measure_sensor(flats: Sequence[Path], darks: Sequence[Path]) -> SensorFile:
     Errors are those of a finite number of pixels. Light that is not even over the sensor counts as
     PRNU.
     """
-    light = read_levels(flats, "FLATS")
-    dark = read_levels(darks, "--darks")
+    return sensor_of(read_levels(flats, "FLATS"), read_levels(darks, "--darks"))
+
+
+def sensor_of(light: Levels, dark: Levels) -> SensorFile:
+    """A sensor from the levels of its flats and darks. Raises InputError as `measure_sensor`."""
     if light.shape != dark.shape:
         raise InputError("--darks: not of the flats' size; give frames of one sensor")
     _refuse_unlike_darks(dark)

@@ -36,7 +36,7 @@ from hilstar.server.bench.cameras import bench_camera
 from tests.support import plain_camera
 from tests.support.benches import TWIN, bench_text
 from tests.support.claims import holds
-from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here, typed
 from tests.support.forks import HILSTAR, Started
 from tests.support.waiting import PATIENCE_S
 
@@ -85,22 +85,14 @@ def plant(folder, **monitor):
         "collimator": {"geometry": "true.toml"},
         "render": {"flux_at_white_e_per_s": WHITE_E_PER_S},
     }
-    (folder / "truth.toml").write_text(bench_text(TWIN, changed))
     q = from_rotation_vector(np.radians([0.2, -0.15, 0.5]))
-    size = tuple(read_bench_file(folder / "bench.toml").config.monitor.resolution_px)
-    size = size[::-1] if monitor.get("rotate_deg", 0) % 180 else size
-    if size != (640, 480):
-        (folder / "truth.toml").write_text(
-            bench_text(TWIN, changed, {"monitor": {"resolution_px": list(size)}})
-        )
+    size = (480, 640) if monitor.get("rotate_deg", 0) % 180 else (640, 480)
+    upright = {"monitor": {"resolution_px": list(size)}}
+    (folder / "truth.toml").write_text(bench_text(TWIN, changed, upright))
     centre = ((size[0] - 1) / 2 + 15, (size[1] - 1) / 2 - 8)
     lens = Lens((0.6, 0.0, 0.0), (0.0, 0.0), (math.radians(1.0), math.radians(-0.4)))
-    write_geometry(
-        folder / "true.toml",
-        Camera(size, 120e3 / 57.65 * 1.01, centre, to_matrix(q), lens),
-        q,
-        NOTES,
-    )
+    camera = Camera(size, 120e3 / 57.65 * 1.01, centre, to_matrix(q), lens)
+    write_geometry(folder / "true.toml", camera, q, NOTES)
     return folder
 
 
@@ -108,10 +100,8 @@ def places_off_arcsec(folder):
     """How far the places that the tracker sees are from where the truth has them, rms over the
     directions of its field.
     """
-    cameras = [
-        bench_camera(file.config, folder)
-        for file in map(read_bench_file, (folder / "bench.toml", folder / "truth.toml"))
-    ]
+    files = [read_bench_file(folder / name) for name in ("bench.toml", "truth.toml")]
+    cameras = [bench_camera(file.config, folder) for file in files]
     sides = [
         np.linspace((1 - SEEN_SHARE) / 2, (1 + SEEN_SHARE) / 2, 15) * (size - 1)
         for size in cameras[0].resolution_px
@@ -198,8 +188,8 @@ def test_a_whole_virtual_session_finds_mirror_and_lens(whole):
     assert (folder / "s" / "bench-before.toml").read_text() == bench_text(TWIN, GAMMA_22)
 
 
-def again_by_hand(folder, *words):
-    result = run_hilstar_here("calibrate", *words, "--json")
+def again_by_hand(line, *words):
+    result = run_hilstar_here("calibrate", *typed(line, *words), "--json")
     assert result.returncode == 0, result.stderr
     return json.loads(result.stdout)
 
@@ -211,59 +201,39 @@ def test_the_commands_of_calibrate_give_the_figures_of_the_steps(whole, tmp_path
     folder, found, _ = whole
     steps = {step["name"]: step["figures"] for step in found["steps"]}
     images = folder / "s" / "images" / "geometry-1"
-    frames = sorted(images.glob("frame_*.png"))
-    words = [
-        "--plan",
-        images,
-        "--dark",
-        images / "dark_000.png",
-        "--tracker-is-ideal",
-        "-o",
-        tmp_path / "geometry.toml",
-    ]
-    geometry = again_by_hand(folder, "geometric", folder / "bench.toml", *frames, *words)
-    assert geometry["model"] == steps["geometry"]["model"]
-    assert geometry["held_out"]["rms_arcsec"] == pytest.approx(
-        steps["geometry"]["held_out_rms_arcsec"], rel=SAME
+    words = f"--plan {images} --dark {images}/dark_000.png -o {tmp_path}/geometry.toml"
+    geometry = again_by_hand(
+        f"geometric {folder}/bench.toml --tracker-is-ideal {words}",
+        *sorted(images.glob("frame_*.png")),
     )
-    assert geometry["error"]["rms_arcsec"] == pytest.approx(
-        steps["geometry"]["error_rms_arcsec"], rel=SAME
-    )
-    focal = geometry["parameters"]["focal_length_px"]["value"]
-    assert focal == pytest.approx(steps["geometry"]["focal_length_px"], rel=SAME)
     light = again_by_hand(
-        folder,
-        "photometric",
-        folder / "s" / "measured.csv",
-        "--bits",
-        10,
-        "-o",
-        tmp_path / "response.toml",
+        f"photometric {folder}/s/measured.csv --bits 10 -o {tmp_path}/response.toml"
     )
-    assert light["holdout"]["rms_mag"] == pytest.approx(
-        steps["photometry"]["held_out_rms_mag"], rel=SAME
+    # as the bench file was before the step: white as it had it
+    white = steps["scale"]["in_bench_file_e_per_s"]
+    text = re.sub(
+        r"flux_at_white_e_per_s = .*",
+        f"flux_at_white_e_per_s = {white!r}",
+        (folder / "bench.toml").read_text(),
     )
-    assert light["black_level"]["relative"] == pytest.approx(
-        steps["photometry"]["black_level"], rel=SAME
-    )
+    (folder / "before-scale.toml").write_text(text)
+    readings = (folder / "s" / "readings.csv").read_text().splitlines()[1:]
+    told = " ".join(f"--reading {line}" for line in readings)
+    scale = again_by_hand(f"scale {folder}/before-scale.toml {told}")
+    assert geometry["model"] == steps["geometry"]["model"]
+    for figure, name, key in (
+        (geometry["held_out"]["rms_arcsec"], "geometry", "held_out_rms_arcsec"),
+        (geometry["error"]["rms_arcsec"], "geometry", "error_rms_arcsec"),
+        (geometry["parameters"]["focal_length_px"]["value"], "geometry", "focal_length_px"),
+        (light["holdout"]["rms_mag"], "photometry", "held_out_rms_mag"),
+        (light["black_level"]["relative"], "photometry", "black_level"),
+        (scale["flux_at_white_e_per_s"], "scale", "flux_at_white_e_per_s"),
+    ):
+        assert figure == pytest.approx(steps[name][key], rel=SAME), key
     own, again = (folder / "s" / "response.toml", tmp_path / "response.toml")
     assert read_toml(own).errors == read_toml(again).errors
     responses = [load_calibration(path, 10).response.light for path in (own, again)]
     assert np.array_equal(*responses)
-    # As the bench file was before the step: white as it had it.
-    text = (folder / "bench.toml").read_text()
-    before = folder / "before-scale.toml"
-    now, then = (
-        steps["scale"][name] for name in ("flux_at_white_e_per_s", "in_bench_file_e_per_s")
-    )
-    before.write_text(
-        re.sub(r"flux_at_white_e_per_s = .*", f"flux_at_white_e_per_s = {then!r}", text)
-    )
-    readings = (folder / "s" / "readings.csv").read_text().splitlines()[1:]
-    scale = again_by_hand(
-        folder, "scale", before, *(word for line in readings for word in ("--reading", line))
-    )
-    assert scale["flux_at_white_e_per_s"] == pytest.approx(now, rel=SAME)
 
 
 def test_the_page_needs_nothing_beside_it(whole):
@@ -279,18 +249,9 @@ def test_the_page_needs_nothing_beside_it(whole):
 
 
 def started(folder, *more):
-    words = [
-        "first-light",
-        folder / "bench.toml",
-        "-o",
-        folder / "s",
-        "--virtual",
-        folder / "truth.toml",
-        *more,
-    ]
-    return Started(
-        [*HILSTAR, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    line = f"first-light {folder}/bench.toml -o {folder}/s --virtual {folder}/truth.toml"
+    words = [*HILSTAR, *typed(line, *map(str, more))]
+    return Started(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def ended_at(process, folder, image, ending):

@@ -65,11 +65,10 @@ from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.instruments.simulate.optics import TwinOptics
 from hilstar.optics.camera import Lens
 from hilstar.optics.psf import GaussianPsf
-from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.tracker.centroids import find_stars, noisiest_background
 from hilstar.tracker.rounding import rounded_light
 from hilstar.tracker.settings import DetectorSettings
-from tests.support.benches import bench_text
+from tests.support.bench_files import filed_bench
 from tests.support.waiting import PATIENCE_S
 
 # A 27-inch monitor before a 500 mm collimator, and a tracker of 50 mm: it sees 6.4 % of the screen.
@@ -91,8 +90,7 @@ PLACES_SIGMAS = 4.0
 
 
 def large_screen(folder):
-    (folder / "bench.toml").write_text(bench_text(LARGE_SCREEN))
-    return read_bench_file(folder / "bench.toml")
+    return filed_bench(folder, LARGE_SCREEN)
 
 
 def true_geometry(file, turn_deg):
@@ -296,9 +294,8 @@ class Dark(ImageSource):
 
 def ran(folder, runs):
     """A session whose steps come to these outcomes, and its exit code."""
-    (folder / "bench.toml").write_text(bench_text())
     (folder / "s").mkdir()
-    file = read_bench_file(folder / "bench.toml")
+    file = filed_bench(folder)
     session = FirstLightSession(folder / "s", file, Dark(), 0, plan=SessionPlan(runs=runs))
     return session, session.run(frozenset(), lambda line: None)
 
@@ -558,10 +555,7 @@ def test_a_stated_blur_of_the_collimator_is_no_bad_focus(tmp_path):
     """Dots are seen through the collimator: with a blur that the file states, `focus` asked to
     turn the focus.
     """
-    (tmp_path / "bench.toml").write_text(
-        bench_text(LARGE_SCREEN, {"collimator": {"psf_sigma_px": 0.5}})
-    )
-    file = read_bench_file(tmp_path / "bench.toml")
+    file = filed_bench(tmp_path, LARGE_SCREEN, {"collimator": {"psf_sigma_px": 0.5}})
     context = StepContext(file, tmp_path, tmp_path, ImageSource(), {}, {}, 0)
     ratio = seen_screen_of(file).tracker_px_a_monitor_px
     assert context.psf_sigma_px == pytest.approx(math.hypot(0.5, 0.5 * ratio))

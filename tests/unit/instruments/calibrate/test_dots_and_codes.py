@@ -55,8 +55,8 @@ from hilstar.instruments.calibrate.geometric.observed import (
     read_observed,
 )
 from hilstar.optics.camera import Camera
-from hilstar.server.bench.bench_file import BenchFile, read_bench_file
-from tests.support.benches import bench_text
+from hilstar.server.bench.bench_file import BenchFile
+from tests.support.bench_files import filed_bench
 from tests.support.closed_camera import CLOSED, ClosedCamera
 from tests.support.refusals import refusal
 
@@ -317,9 +317,7 @@ def test_the_cure_of_an_orientation_makes_the_image_upright(tmp_path, turns, is_
         turned = np.rot90(shown, turns)
         return turned[:, ::-1] if is_mirrored else turned
 
-    path = tmp_path / "bench.toml"
-    path.write_text(bench_text(CLOSED, {"monitor": {"resolution_px": [96, 96]}}))
-    file = read_bench_file(path)
+    file = filed_bench(tmp_path, CLOSED, {"monitor": {"resolution_px": [96, 96]}})
     camera = ClosedCamera(mounted=mounted)
     codes = np.zeros((96, 96), dtype=np.uint16)
     x, y = np.array([30, 60, 30, 70]), np.array([20, 20, 75, 65])
@@ -436,12 +434,10 @@ def test_a_row_that_is_no_centroid_is_refused_with_its_line(tmp_path, row):
 )
 def test_a_plan_of_a_larger_screen_is_refused_before_its_images(tmp_path, x_px, y_px, is_beyond):
     """Of a screen that is higher than it is wide."""
-    path = tmp_path / "bench.toml"
-    path.write_text(bench_text(CLOSED, {"monitor": {"resolution_px": [96, 120]}}))
     plan = tmp_path / "plan.csv"
     plan.write_text(f"frame,dot,x_px,y_px\n0,0,10,10\n1,1,{x_px},{y_px}\n")
     missing = [tmp_path / "none.csv"]
-    file = read_bench_file(path)
+    file = filed_bench(tmp_path, CLOSED, {"monitor": {"resolution_px": [96, 120]}})
     words = refusal(calibrate_files, file, missing, plan, None, tracker_is_ideal=True)
     off = f"{plan}: has dots off this monitor of 96 x 120 px"
     assert words.startswith(off if is_beyond else f"{missing[0]}: ")

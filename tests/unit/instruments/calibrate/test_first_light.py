@@ -52,6 +52,7 @@ from hilstar.instruments.calibrate.first_light.session import (
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.optics.scan import Orientation
 from hilstar.server.bench.bench_file import read_bench_file
+from tests.support.bench_files import filed_bench
 from tests.support.benches import bench_text
 from tests.support.claims import holds
 from tests.support.damage import NO_JSON
@@ -348,9 +349,7 @@ def test_patterns_have_a_window_of_their_own_screen_s_size_and_keep_it_while_tha
     with PatternDisplay() as shown:
         window_of_size: dict[tuple[int, int], RecordedWindow] = {}
         for keys, size_px in screens:
-            path = tmp_path / "bench.toml"
-            path.write_text(bench_text({"monitor": keys}))
-            window = shown._window_for(read_bench_file(path))
+            window = shown._window_for(filed_bench(tmp_path, {"monitor": keys}))
             assert window is window_of_size.setdefault(size_px, window)
             assert RecordedWindow.opened == [window]
             assert window.settings.resolution_px == size_px

@@ -4,6 +4,8 @@ them and of stars.
 
 from __future__ import annotations
 
+from contextlib import closing
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -42,8 +44,8 @@ from hilstar.instruments.calibrate.first_light.stars import scale, trend
 from hilstar.instruments.calibrate.geometric.observed import read_image
 from hilstar.instruments.calibrate.plan import Patch
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
-from hilstar.server.bench.bench_file import read_bench_file
-from tests.support.benches import TWIN, bench_text
+from tests.support.bench_files import filed_bench
+from tests.support.benches import TWIN
 from tests.support.refusals import refusal
 from tests.support.spectra import bump, write_channels, write_panel
 
@@ -125,11 +127,14 @@ class Camera(ImageSource):
         return self.save(stem, image) if self.has_unlit else None
 
 
+def context_of(folder, camera, *changes):
+    """A step before a camera, on the twin's small bench."""
+    file = filed_bench(folder, TWIN, *changes)
+    return StepContext(file, folder, folder / "images", camera, {}, {}, 96)
+
+
 def read_patches(tmp_path, camera, codes=(0, 100, 300, 511, 700, 900, 1023, 0)):
-    (tmp_path / "bench.toml").write_text(bench_text(TWIN))
-    context = StepContext(
-        read_bench_file(tmp_path / "bench.toml"), tmp_path, tmp_path / "i", camera, {}, {}, 96
-    )
+    context = context_of(tmp_path, camera)
     photometer = Photometer(context, SIGMA_PX, Assumed({"w": srgb_response(10).light}, 0.0))
     return photometer.read([Patch(code, "w") for code in codes])
 
@@ -261,12 +266,8 @@ def test_figures_of_a_response_are_in_their_units():
     ],
 )
 def test_a_response_is_refused_beyond_its_limit_and_its_noise(tmp_path, changes, verdict, words):
-    bench = bench_text(TWIN, {"verify": {"flux_mag": 0.05}})
-    (tmp_path / "bench.toml").write_text(bench)
     camera = Camera(srgb_response(10).light, 1.0)
-    context = StepContext(
-        read_bench_file(tmp_path / "bench.toml"), tmp_path, tmp_path, camera, {}, {}, 96
-    )
+    context = context_of(tmp_path, camera, {"verify": {"flux_mag": 0.05}})
     outcome = _judged(context, response_figures(**changes), (), ())
     assert outcome.verdict == verdict
     assert words in outcome.line
@@ -279,11 +280,8 @@ def test_a_response_is_refused_beyond_its_limit_and_its_noise(tmp_path, changes,
 
 def test_a_hot_pixel_of_the_dark_frame_makes_no_image_too_bright(tmp_path):
     """It has 70 % of the range in the dark, and all of it with light: 0.8 of it is too bright."""
-    (tmp_path / "bench.toml").write_text(bench_text(TWIN))
     camera = Camera(srgb_response(10).light, 1.0)
-    context = StepContext(
-        read_bench_file(tmp_path / "bench.toml"), tmp_path, tmp_path, camera, {}, {}, 96
-    )
+    context = context_of(tmp_path, camera)
     dark = np.full((400, 400), FLOOR_DN)
     dark[30, 40] = 0.7 * FULL_DN
     lit = dark.copy()
@@ -331,14 +329,10 @@ def test_a_trend_s_error_is_that_of_its_stars_weights(rng):
 
 def on_the_twin(tmp_path, step, bench, truth, patches=72):
     """What a step comes to on a bench that is truly another."""
-    (tmp_path / "bench.toml").write_text(bench_text(TWIN, bench))
-    (tmp_path / "truth.toml").write_text(bench_text(TWIN, truth))
-    file, true = (read_bench_file(tmp_path / name) for name in ("bench.toml", "truth.toml"))
-    source = VirtualBench(file, true, 0)
-    try:
+    file = filed_bench(tmp_path, TWIN, bench)
+    true = filed_bench(tmp_path, TWIN, truth, name="truth.toml")
+    with closing(VirtualBench(file, true, 0)) as source:
         return step(StepContext(file, tmp_path, tmp_path / "images", source, {}, {}, patches))
-    finally:
-        source.close()
 
 
 def test_the_newest_image_of_the_virtual_bench_is_its_file(tmp_path):

@@ -4,6 +4,8 @@ their errors do.
 
 from __future__ import annotations
 
+from contextlib import closing
+
 import numpy as np
 import pytest
 
@@ -48,22 +50,12 @@ def uneven_bench(folder, grid, name="srgb"):
 def did(folder, step, patches=0, known=None, watched_s=0.0):
     """What a step comes to, with the bench file rewritten as a session does it."""
     file, true = (read_bench_file(folder / name) for name in ("bench.toml", "truth.toml"))
-    source = VirtualBench(file, true, 0)
-    try:
-        outcome = step(
-            StepContext(
-                file,
-                folder,
-                folder / step.__name__,
-                source,
-                known or {},
-                {},
-                patches,
-                watched_s=watched_s,
-            )
+    images = folder / step.__name__
+    with closing(VirtualBench(file, true, 0)) as source:
+        context = StepContext(
+            file, folder, images, source, known or {}, {}, patches, watched_s=watched_s
         )
-    finally:
-        source.close()
+        outcome = step(context)
     rewrite(file, outcome.changes)
     return outcome
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -399,14 +398,21 @@ def test_a_calibration_has_as_many_degrees_of_freedom_as_readings_less_one_a_lev
 def test_additivity_is_as_sure_as_its_primaries_by_their_light_and_white(tmp_path):
     """Linear channels of 20, 50 and 30 units before a white of 80: at all codes a quarter more."""
     light = np.linspace(0, 1, 1001)
+    path = measure_plan(tmp_path / "m.csv", CURVES["gamma"], np.random.default_rng(0))
+    measured = fit_channel(read_measurements(path), "w")
     fits = {}
     whites = {"w": (80.0, 0.01, 0.0), "r": (20.0, 0.03, 0.04), "g": (50.0, 0.0, 0.02)}
     for name, (white, own, of_white) in (whites | {"b": (30.0, 0.05, 0.0)}).items():
+        levels = replace(
+            measured.levels,
+            mean=np.array([white]),
+            count=np.ones(1),
+            stated=np.array([of_white * white]),
+            additive_noise=0.0,
+        )
         error = np.full(1001, own)
-        levels = SimpleNamespace(mean=np.array([white]))
-        levels.standard_error = lambda noise, by=of_white * white: np.array([by])
-        fits[name] = SimpleNamespace(
-            light=light, white=white, error=error, levels=levels, noise_relative=0.0
+        fits[name] = replace(
+            measured, light=light, white=white, error=error, levels=levels, noise_relative=0.0
         )
     found = _additivity(fits)
     assert found["additivity_percent"] == pytest.approx(25.0)

@@ -61,6 +61,7 @@ from hilstar.instruments.calibrate.geometric.geometry_fit import (
 from hilstar.instruments.calibrate.geometric.observed import Observed, dot_centroids, measure_images
 from hilstar.optics.camera import Camera, Lens
 from hilstar.server.bench.bench_file import read_bench_file
+from tests.support.bench_files import filed_bench
 from tests.support.benches import bench_text
 from tests.support.refusals import refusal
 
@@ -651,9 +652,8 @@ def test_a_tracker_s_lens_is_held_where_it_is_stated(tmp_path, has_model, is_ide
     tracker = dict(SMALL_FIELD["tracker"])
     if has_model:
         tracker["distortion"] = "lens.toml"
-    path = tmp_path / "bench.toml"
-    path.write_text(bench_text(SMALL_FIELD, {"tracker": tracker}))
-    assert is_tracker_known(read_bench_file(path), is_ideal=is_ideal) == is_known
+    file = filed_bench(tmp_path, SMALL_FIELD, {"tracker": tracker})
+    assert is_tracker_known(file, is_ideal=is_ideal) == is_known
 
 
 @pytest.mark.parametrize(("sigma_px", "is_freed"), [(0.4, True), (0.8, True), (0.81, False)])

@@ -11,8 +11,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hilstar.basics.errors import InputError
-from hilstar.instruments.calibrate import live_focus
 from hilstar.instruments.calibrate.first_light.focus import Sharpness
 from hilstar.instruments.calibrate.first_light.image_sources import ImageSource, VirtualBench
 from hilstar.instruments.calibrate.live_focus import focus_readings, follow_answers, streak
@@ -20,6 +18,7 @@ from hilstar.server.answers.answer import Answer
 from hilstar.server.answers.star_widths import FocusCurve, sparkline
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import TWIN, bench_text
+from tests.support.closed_camera import ClosedCamera, closed_context, power_of
 from tests.support.commands import run_hilstar_here
 from tests.support.fake_clock import FakeClock
 from tests.support.refusals import refusal
@@ -130,41 +129,19 @@ def test_dots_that_saturate_have_no_figure_and_are_dimmed(benches, tmp_path):
         assert next(images).code < reading.code == 2**10 - 1
 
 
-def test_a_pattern_is_shown_to_its_watcher_once_and_images_are_read_as_they_come(
-    tmp_path, monkeypatch
-):
-    """Dots of more than 600 DN saturate a tracker that sees codes as they are."""
-    (tmp_path / "bench.toml").write_text(bench_text(TWIN))
-    file = read_bench_file(tmp_path / "bench.toml")
-    looked = {}
-
-    def look(file, pattern, stem, exposure_s):
-        looked[stem] = float(pattern.codes.max())
-        return stem
-
-    def sharpness(light, screen, detector):
-        raise InputError(f"{light:.0f} DN are no dots")
-
-    source = SimpleNamespace(look=look, pixels=lambda path, size_px: looked[path])
-    dots = {
-        "seen_screen_of": lambda file: None,
-        "first_dots": lambda screen: None,
-        "dot_image": lambda plan, frame, size_px, code: np.full((2, 2), code, dtype=np.uint16),
-        "is_too_bright": lambda image, dark, detector: image > 600,
-        "seen_sharpness": sharpness,
-    }
-    for name, value in dots.items():
-        monkeypatch.setattr(live_focus, name, value)
+def test_a_pattern_is_shown_to_its_watcher_once_and_images_are_read_as_they_come(tmp_path):
+    """Of a screen whose dots saturate the tracker in their first codes."""
+    camera = ClosedCamera(power_of(2.2), 400_000.0)
+    file = closed_context(tmp_path, camera).file
     watched = []
-    images = focus_readings(file, source, tmp_path, 1.0, watched.append)
+    images = focus_readings(file, camera, tmp_path, 0.1, watched.append)
     readings = [next(images) for _ in range(6)]
-    first, second, *others = (reading.code for reading in readings)
-    assert first == 1023
-    assert others == [others[0]] * 4
-    assert 0 < others[0] < 600
-    shown = [int(pattern.codes.max()) for pattern in watched]
-    assert shown == list(dict.fromkeys([first, second, others[0]]))
-    assert readings[-1].why == f"{others[0]} DN are no dots"
+    codes = [reading.code for reading in readings]
+    *bright, settled = dict.fromkeys(codes)
+    assert bright[0] == 1023 and bright == sorted(bright, reverse=True)
+    assert codes == [*bright, *[settled] * (6 - len(bright))]
+    assert [int(pattern.codes.max()) for pattern in watched] == [*bright, settled]
+    assert [reading.figure is None for reading in readings] == [code in bright for code in codes]
     assert [reading.number for reading in readings] == [1, 2, 3, 4, 5, 6]
 
 

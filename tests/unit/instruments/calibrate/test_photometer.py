@@ -37,7 +37,8 @@ from hilstar.tracker.rounding import (
     rounding_error,
     rounding_rms,
 )
-from tests.support.benches import TWIN, bench_text
+from tests.support.bench_files import filed_bench
+from tests.support.benches import TWIN
 from tests.support.refusals import refusal
 from tests.support.tables import write_readings
 
@@ -76,9 +77,9 @@ def power_law_bench(folder, detector, collimator_mm=120, black=BLACK):
         "tracker.detector": detector,
         "collimator": {"focal_length_mm": collimator_mm},
     }
-    (folder / "bench.toml").write_text(bench_text(TWIN, tables))
+    filed_bench(folder, TWIN, tables)
     true = tables | {"monitor": {"bits": BITS, "calibration": "true-light.toml"}}
-    (folder / "truth.toml").write_text(bench_text(TWIN, true))
+    filed_bench(folder, TWIN, true, name="truth.toml")
 
 
 def measured_light(folder, seed, sets_exposure=True, black=BLACK):
@@ -88,12 +89,9 @@ def measured_light(folder, seed, sets_exposure=True, black=BLACK):
     file, true = (read_bench_file(folder / name) for name in ("bench.toml", "truth.toml"))
     source = VirtualBench(file, true, seed)
     source.sets_exposure = sets_exposure
-    try:
-        outcome = photometry(
-            StepContext(file, folder, folder / f"images-{seed}", source, {}, {}, 96)
-        )
-    finally:
-        source.close()
+    with closing(source):
+        context = StepContext(file, folder, folder / f"images-{seed}", source, {}, {}, 96)
+        outcome = photometry(context)
     assert outcome.verdict == "done", outcome.line
     response = load_calibration(folder / "response.toml", BITS).response
     light = gamma_response(BITS, POWER).light
@@ -137,10 +135,9 @@ def test_the_glow_of_a_screen_that_is_darker_at_its_edges_is_counted_by_its_ligh
         tmp_path / "known.toml", head, {"w": srgb_response(BITS).light}, 0.0, NotesTable()
     )
     add_uniformity(tmp_path / "known.toml", grid, EVEN_ERROR)
-    bench = tmp_path / "bench.toml"
     tables = {"monitor": {"bits": BITS, "calibration": "known.toml"}, "tracker.detector": NOISY}
     tables["collimator"] = {"focal_length_mm": 120}
-    bench.write_text(bench_text(TWIN, tables))
+    filed_bench(tmp_path, TWIN, tables)
     _, off, black = measured_light(tmp_path, 0, black=BRIGHT_BLACK)
     assert np.abs(off).max() < SURE
     assert abs(black) < SURE

@@ -37,6 +37,7 @@ from hilstar.instruments.calibrate.reference import (
 )
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.cameras import bench_camera
+from tests.support.bench_files import filed_bench
 from tests.support.benches import bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.refusals import refusal
@@ -195,9 +196,7 @@ def test_readings_that_tell_no_rotation_are_refused(
 def test_a_dot_by_its_pixel_is_where_the_bench_shows_it(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
-    bench = tmp_path / "bench.toml"
-    bench.write_text(bench_text())
-    file = read_bench_file(bench)
+    file = filed_bench(tmp_path)
     camera = bench_camera(file.config, file.folder)
     path = tmp_path / "readings.csv"
     path.write_text("target,azimuth_deg,elevation_deg,x_px,y_px\ndot,0,0,200,300\n")
@@ -218,8 +217,6 @@ def test_the_command_prints_a_table_that_a_bench_file_takes(
     assert done.returncode == 0 and "one sigma" in done.stdout
     table = (tmp_path / "alignment.toml").read_text()
     assert table in done.stdout
-    before = tmp_path / "bench.toml"
-    before.write_text(bench_text())
     after = tmp_path / "with.toml"
     after.write_text(f"{bench_text()}\n{table}")
     file = read_bench_file(after)
@@ -227,7 +224,7 @@ def test_the_command_prints_a_table_that_a_bench_file_takes(
     off = axis_errors_arcsec(np.array(file.config.alignment.q_mon_to_reference), true)
     assert np.abs(off).max() < 5 * max(fitted_reference(tmp_path, text).sigma_arcsec)
     # what is said of a bench changes no frame
-    assert file.sha256 == read_bench_file(before).sha256
+    assert file.sha256 == filed_bench(tmp_path).sha256
     assert_refused(run_hilstar_here(*words[:3], "-o", "a.csv", cwd=tmp_path), 2, ".toml")
 
 

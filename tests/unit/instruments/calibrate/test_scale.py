@@ -20,7 +20,7 @@ from hilstar.instruments.calibrate.scale import (
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.config import read_config
-from tests.support.benches import bench_text
+from tests.support.bench_files import filed_bench
 from tests.support.refusals import refusal
 
 MAG = 2.5 / math.log(10)
@@ -29,10 +29,9 @@ MAG = 2.5 / math.log(10)
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory):
     """A bench of 4 e- a DN."""
-    path = tmp_path_factory.mktemp("scale") / "bench.toml"
     tables = {"sky": {"faintest_v_mag": 4.0}, "tracker.detector": {"gain_e_per_dn": 4.0}}
-    path.write_text(bench_text(tables, {"render": {"quantisation": "round"}}))
-    with open_bench(read_bench_file(path)) as made:
+    tables["render"] = {"quantisation": "round"}
+    with open_bench(filed_bench(tmp_path_factory.mktemp("scale"), tables)) as made:
         yield made
 
 

@@ -23,6 +23,7 @@ from hilstar.instruments.calibrate.sensor import (
     draw_curves,
     import_emva,
     measure_sensor,
+    sensor_of,
     write_sensor,
 )
 from hilstar.server.bench.config import read_config
@@ -402,7 +403,7 @@ def line_errors(place, sigma, pixels):
 
 
 @pytest.mark.parametrize(("largest_dn", "bits"), [(4095.0, 12), (4096.0, 13)])
-def test_a_sensor_s_figures_are_the_lines_of_its_frames(monkeypatch, largest_dn, bits):
+def test_a_sensor_s_figures_are_the_lines_of_its_frames(largest_dn, bits):
     """Levels without scatter, of 0.5 DN an electron; the fourth is full, and the fifth beyond it."""
     k, prnu = 0.5, 0.02
     dark_s = np.array([0.0, 2.0, 8.0])
@@ -428,9 +429,7 @@ def test_a_sensor_s_figures_are_the_lines_of_its_frames(monkeypatch, largest_dn,
         300.0,
         (80, 60),
     )
-    levels = {"FLATS": light, "--darks": dark}
-    monkeypatch.setattr(sensor, "read_levels", lambda paths, what: levels[what])
-    found = measure_sensor([], [])
+    found = sensor_of(light, dark)
     keys = found.keys
     wanted = {
         "gain_e_per_dn": 2.0,

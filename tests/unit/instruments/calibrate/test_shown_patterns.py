@@ -35,9 +35,9 @@ from hilstar.instruments.calibrate.geometric.dots import DotPlan, dot_image, sho
 from hilstar.instruments.calibrate.plan import Patch, show_patches
 from hilstar.instruments.calibrate.until_key import stays_until_key
 from hilstar.optics.scan import Orientation
-from hilstar.server.bench.bench_file import BenchFile, read_bench_file
+from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.genicam.camera import CameraImage
-from tests.support.benches import bench_text
+from tests.support.bench_files import filed_bench
 
 SCREEN_PX = (320, 240)
 
@@ -153,9 +153,7 @@ def panel(monkeypatch) -> Panel:
 
 
 def bench(folder: Path, **monitor: object) -> BenchFile:
-    path = folder / "bench.toml"
-    path.write_text(bench_text({"monitor": {"resolution_px": list(SCREEN_PX)} | monitor}))
-    return read_bench_file(path)
+    return filed_bench(folder, {"monitor": {"resolution_px": list(SCREEN_PX)} | monitor})
 
 
 def pattern_of(*levels: int) -> Pattern:
@@ -393,9 +391,7 @@ def test_a_camera_exposes_once_when_the_panel_shows_the_pattern(
 
     monkeypatch.setattr(image_sources, "GenicamCamera", opened)
     changes = {"tracker.detector": {"bits": 12}, "tracker.camera": {"gain": 3.0}}
-    path = tmp_path / "bench.toml"
-    path.write_text(bench_text(changes, {"monitor": {"resolution_px": list(SCREEN_PX)}}))
-    file = read_bench_file(path)
+    file = filed_bench(tmp_path, changes, {"monitor": {"resolution_px": list(SCREEN_PX)}})
     with caplog.at_level(logging.WARNING):
         source = GrabCamera(file, "S42")
         taken = source.look(file, pattern_of(200), tmp_path / "frame_003", 0.02)

@@ -37,9 +37,8 @@ from hilstar.instruments.simulate.live_exposure import (
 )
 from hilstar.instruments.simulate.tracker_process import OwnClock, Planted, PlantedErrors
 from hilstar.server.answers.answer import Answer, ReportedStar
-from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.tracker.identify import MIN_STARS, FoundStars, Identified
-from tests.support.benches import bench_text
+from tests.support.bench_files import filed_bench
 from tests.support.refusals import refusal
 
 PERIOD_NS = 100
@@ -116,9 +115,8 @@ LEVEL_ERROR = 0.01
 
 @pytest.fixture(scope="module")
 def live(tmp_path_factory):
-    path = tmp_path_factory.mktemp("live") / "bench.toml"
-    path.write_text(bench_text(GLOWING))
-    with LiveTracker(read_bench_file(path), np.random.default_rng(1)) as tracker:
+    file = filed_bench(tmp_path_factory.mktemp("live"), GLOWING)
+    with LiveTracker(file, np.random.default_rng(1)) as tracker:
         yield tracker
 
 

@@ -37,6 +37,7 @@ from hilstar.tracker.centroids import CentroidSettings, find_stars
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.mosaic import in_pixels, luminance
 from hilstar.tracker.settings import DetectorSettings
+from tests.support.bench_files import filed_bench
 from tests.support.benches import ORION_Q, bench_text
 from tests.support.claims import holds
 from tests.support.commands import assert_refused, run_hilstar_here
@@ -569,10 +570,8 @@ def test_a_field_s_budget_is_of_its_own_stars_in_the_light_behind_each(tmp_path,
     """A tracker of 300 x 200 px on Orion's belt: every star of the field by a pinhole."""
     monkeypatch.setattr(noise, "TRIALS", 4)
     tracker = {"resolution_px": [300, 200], "focal_length_mm": 20, "transmission": None}
-    path = tmp_path / "bench.toml"
     changes = {"tracker": tracker, "sky": {"faintest_v_mag": 7.0}}
-    path.write_text(bench_text(changes, {"background": {"electrons_per_px": 50.0}}))
-    file = read_bench_file(path)
+    file = filed_bench(tmp_path, changes, {"background": {"electrons_per_px": 50.0}})
     finder = CentroidSettings()
     found = noise.noise_budget(file, np.array(ORION_Q), finder, np.random.default_rng(1))
     stars = bench_stars(file.config, tmp_path)
@@ -771,9 +770,7 @@ def test_a_mosaic_s_star_has_the_light_of_its_own_channels_before_each_colour_s_
     nm = np.arange(400.0, 721.0, 20.0)
     curves = {"r": bump(620.0, 60, nm), "g": bump(540.0, 60, nm), "b": 0.5 * bump(460.0, 60, nm)}
     keys = write_channels(tmp_path, nm, curves)
-    path = tmp_path / "bench.toml"
-    path.write_text(bench_text({"tracker": keys, "tracker.detector": {"bayer": "grbg"}}))
-    file = read_bench_file(path)
+    file = filed_bench(tmp_path, {"tracker": keys, "tracker.detector": {"bayer": "grbg"}})
     sky_e = np.tile([[20.0, 50.0], [5.0, 24.0]], (4, 6))
     whole = noisy_star(file, sky_e)
     star, sky = whole.mosaic
@@ -796,9 +793,7 @@ def test_fields_all_over_the_sky_are_identified_by_four_stars_and_more(tmp_path,
     monkeypatch.setattr(noise, "TRIALS", 4)
     monkeypatch.setattr(noise, "SKY_FIELDS", fields)
     tracker = {"resolution_px": [300, 200], "focal_length_mm": 15, "transmission": None}
-    path = tmp_path / "bench.toml"
-    path.write_text(bench_text({"tracker": tracker, "sky": {"faintest_v_mag": 5.0}}))
-    file = read_bench_file(path)
+    file = filed_bench(tmp_path, {"tracker": tracker, "sky": {"faintest_v_mag": 5.0}})
     budget = noise.noise_budget(file, None, CentroidSettings(), np.random.default_rng(2))
     q = np.random.default_rng(2).standard_normal((fields, 4))
     stars = bench_stars(file.config, tmp_path)

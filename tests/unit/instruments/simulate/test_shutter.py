@@ -27,6 +27,7 @@ from hilstar.server.bench.bench_file import bench_file_of, read_bench_file
 from hilstar.server.sync import Exposures, seen_at
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import DetectorSettings
+from tests.support.bench_files import filed_bench
 from tests.support.benches import ORION_Q, TWIN, bench_text
 from tests.support.commands import run_hilstar_here
 from tests.support.stars import stars_at
@@ -215,10 +216,10 @@ def test_a_still_picture_is_late_by_the_scan_out_which_drawing_along_the_path_ta
     the screen light early, so that more of each exposure is of later frames: without motion it
     stands where it will be by that time.
     """
-    path = tmp_path / "bench.toml"
-    path.write_text(bench_text(TWIN, VEGA_ALONE, {"render": {"motion": motion}}))
     q = from_radec_roll_deg(279.2347, 38.7837 - 5.0, 0.0)
-    display = DisplayTracker(read_bench_file(path))
+    display = DisplayTracker(
+        filed_bench(tmp_path, TWIN, VEGA_ALONE, {"render": {"motion": motion}})
+    )
     centres = []
     for rate_deg_s in (0.0, 2.0):
         view = View.exposure(q, np.radians(np.array([0.0, rate_deg_s, 0.0])), WHOLE_EXPOSURE_S)
@@ -308,12 +309,10 @@ def test_rows_are_exposed_in_the_order_that_the_bench_file_says_in_microseconds(
     tmp_path, direction
 ):
     """100 rows of 40 us: the first and the last are exposed 3.96 ms apart, about the middle."""
-    path = tmp_path / "bench.toml"
     detector = {"shutter": "rolling", "row_time_us": 40.0, "row_direction": direction}
-    path.write_text(
-        bench_text({"tracker": {"resolution_px": [80, 100]}, "tracker.detector": detector})
-    )
-    tracker = read_bench_file(path).config.tracker
+    tracker = filed_bench(
+        tmp_path, {"tracker": {"resolution_px": [80, 100]}, "tracker.detector": detector}
+    ).config.tracker
     view = rolled(View(IDENTITY, np.zeros(3)), tracker)
     late_s = view.scan.late_s(np.array([3.0, 3.0, 70.0]), np.array([0.0, 99.0, 49.5]), (80, 100))
     first_s = -99 / 2 * 40e-6 if direction == "down" else 99 / 2 * 40e-6

@@ -14,18 +14,15 @@ from hilstar.basics.rotation import from_rotation_vector
 from hilstar.basics.units import NS_PER_S
 from hilstar.instruments.simulate.exposures import view_at
 from hilstar.instruments.simulate.simulator import Simulator, TrackerBackground, full_e, gathered
-from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.cameras import tracker_camera
 from hilstar.tracker.settings import DetectorSettings
-from tests.support.benches import bench_text
+from tests.support.bench_files import filed_bench
 
 
 def bench(folder, *changes):
     """A bench of few stars before a small tracker."""
-    path = folder / "bench.toml"
     small = {"tracker": {"resolution_px": [64, 48]}, "sky": {"faintest_v_mag": 3.0}}
-    path.write_text(bench_text(small, *changes))
-    return read_bench_file(path)
+    return filed_bench(folder, small, *changes)
 
 
 @pytest.mark.parametrize(
@@ -70,11 +67,9 @@ def test_a_detector_without_a_mosaic_gathers_the_glow_of_all_channels():
 def test_a_pixel_of_a_wide_field_has_its_own_solid_angle_across_and_down(tmp_path):
     """The cube of the cosine of a pixel's angle from the axis, on 300 x 200 px."""
     tracker = {"resolution_px": [300, 200], "focal_length_mm": 5.0, "pixel_pitch_um": 13.0}
-    path = tmp_path / "bench.toml"
-    path.write_text(
-        bench_text({"tracker": tracker}, {"background": {"zodiacal_v_mag_arcsec2": 20.0}})
+    file = filed_bench(
+        tmp_path, {"tracker": tracker}, {"background": {"zodiacal_v_mag_arcsec2": 20.0}}
     )
-    file = read_bench_file(path)
     light_e = TrackerBackground(
         file.config, tmp_path, tracker_camera(file.config.tracker, tmp_path)
     ).steady_e

@@ -18,11 +18,10 @@ from hilstar.instruments.simulate.star_finder import (
 )
 from hilstar.instruments.verify.verdict import median
 from hilstar.optics.psf import GaussianPsf
-from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.build import open_bench
 from hilstar.tracker.centroiders import FAMILY
 from hilstar.tracker.centroids import Centroids, CentroidSettings, LocalBackground
-from tests.support.benches import bench_text
+from tests.support.bench_files import filed_bench
 from tests.support.spectra import write_channels
 
 # Of a star of sigma 1 px in pixels: a window's S-curve, a box's cut wings.
@@ -94,9 +93,7 @@ def test_blobs_begin_at_a_fifth_of_the_faintest_star_s_peak_of_red_in_a_mosaic(
         tables["tracker"] |= write_channels(tmp_path, nm, curves)
         tables["tracker.detector"] = {"bayer": bayer}
         tables["render"]["colour"] = "white"
-    path = tmp_path / "bench.toml"
-    path.write_text(bench_text(tables))
-    with open_bench(read_bench_file(path)) as bench:
+    with open_bench(filed_bench(tmp_path, tables)) as bench:
         finder = star_finder(bench, 3.0)
         rates = bench.shown_stars.electrons_per_s
         faintest_e_per_s = rates[rates >= bench.faintest_shown_e_per_s].min()

@@ -18,9 +18,8 @@ from hilstar.instruments.compare.sky_comparison import common_motion
 from hilstar.instruments.simulate import twin
 from hilstar.instruments.simulate.star_finder import CROWDED_SHARE, crowded
 from hilstar.optics.psf import GaussianPsf
-from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.build import open_bench
-from tests.support.benches import bench_text
+from tests.support.bench_files import filed_bench
 from tests.support.spectra import bump, write_channels, write_panel
 
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
@@ -40,14 +39,13 @@ def test_exposures_of_a_free_tracker_fill_a_refresh_period_evenly(count):
 @pytest.mark.parametrize("exposure_s", [0.1, 0.0999, 0.1001])
 def test_an_exposure_is_the_mean_of_its_own_frames(tmp_path, exposure_s):
     """Three frames of 1/30 s from frame 7 on, each with codes of its own, on two panels."""
-    path = tmp_path / "bench.toml"
-    path.write_text(
-        bench_text(
-            {"tracker": {"exposure_s": exposure_s}, "sky": {"faintest_v_mag": 5.0}},
-            {"monitor": {"refresh_hz": 30.0, "bits": 5}, "render": {"quantisation": "temporal"}},
-        )
-    )
-    with open_bench(read_bench_file(path)) as bench:
+    tables = {
+        "tracker": {"exposure_s": exposure_s},
+        "sky": {"faintest_v_mag": 5.0},
+        "monitor": {"refresh_hz": 30.0, "bits": 5},
+        "render": {"quantisation": "temporal"},
+    }
+    with open_bench(filed_bench(tmp_path, tables)) as bench:
         frame = bench.frame(ORION_Q, 7)
         panels = [bench.panel, replace(bench.panel, flux_at_white_e_per_s=1e9)]
         exposed = twin.exposure_lights(bench, frame, 7, panels)
@@ -109,11 +107,8 @@ def test_a_tracker_pixel_has_as_many_monitor_pixels_along_a_side_as_their_angles
         "monitor": {"resolution_px": [64, 48], "pixel_pitch_um": 50.0},
         "collimator": {"focal_length_mm": 100.0},
     }
-    path = tmp_path / "bench.toml"
-    path.write_text(
-        bench_text(tables, {"sky": {"faintest_v_mag": 3.0}, "render": {"quantisation": "round"}})
-    )
-    with twin.Twin(read_bench_file(path)) as made:
+    tables |= {"sky": {"faintest_v_mag": 3.0}, "render": {"quantisation": "round"}}
+    with twin.Twin(filed_bench(tmp_path, tables)) as made:
         assert made.monitor_px_per_px == pytest.approx(4.0)
 
 
@@ -149,9 +144,7 @@ def test_a_true_white_is_that_of_all_primaries(tmp_path, true_e_per_s):
         "verify": {"true_flux_at_white_e_per_s": true_e_per_s},
         "sky": {"faintest_v_mag": 3.0},
     }
-    path = tmp_path / "bench.toml"
-    path.write_text(bench_text(tables))
-    with open_bench(read_bench_file(path)) as bench:
+    with open_bench(filed_bench(tmp_path, tables)) as bench:
         panel = twin.true_panel(bench)
         assumed = [primary.flux_at_white_e_per_s for primary in bench.panel.primaries]
     white_e_per_s = true_e_per_s or 1e5

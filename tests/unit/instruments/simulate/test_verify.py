@@ -16,6 +16,7 @@ from hilstar.instruments.verify.summary import summarise, verify
 from hilstar.instruments.verify.verdict import Verdict, judge
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.config import read_config
+from tests.support.bench_files import filed_bench
 from tests.support.benches import TWIN, bench_text
 
 # Measured 0.005 px; a lens that is not undone is 1.6 px off.
@@ -231,9 +232,7 @@ def test_a_field_without_a_star_says_how_many_the_catalogue_has_there(tmp_path):
         "tracker": {"focal_length_mm": 150, "resolution_px": [128, 128]},
         "collimator": {"focal_length_mm": 720},
     }
-    path = tmp_path / "bench.toml"
-    path.write_text(bench_text(TWIN, narrow))
-    verdict = verify(read_bench_file(path), 2, np.random.default_rng(3))
+    verdict = verify(filed_bench(tmp_path, TWIN, narrow), 2, np.random.default_rng(3))
     # 0.64 degrees, and 2900 stars to V = 5.5 over 41 253 square degrees
     assert "0.028 stars to V = 5.5 are in the tracker's field on average" in verdict.reasons[0]
     assert "[sky] catalogue with fainter stars" in verdict.reasons[0]

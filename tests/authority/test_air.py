@@ -372,8 +372,6 @@ def test_below_the_horizon_there_is_neither_star_nor_sky(tmp_path, caplog):
         ('extinction = "paranall"', "paranal"),
         ("extinction = -1.0", "0 to 10"),
         ("latitude = 3.0", "latitude_deg"),
-        ('[spacecraft]\norbit = "geocentre"', "[site] is a place on the ground"),
-        ("[sky.bodies]\nearth = true", "[site] is a place on the ground"),
     ],
 )
 def test_a_wrong_site_is_one_line(tmp_path, keys, said):

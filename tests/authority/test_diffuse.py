@@ -277,32 +277,6 @@ def test_a_map_leaves_the_screen_over_any_edge(tmp_path):
             assert drawn == sorted(drawn, reverse=True)
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"BUNIT": None}, "no unit; write BUNIT"),
-        ({"BUNIT": "K"}, "unit 'K', which is no surface brightness"),
-        ({"BUNIT": "Jy"}, "unit 'Jy', which is no surface brightness"),
-        (
-            {"CTYPE1": "X", "CTYPE2": "Y"},
-            "without a place on the sky; give a FITS image with a WCS",
-        ),
-    ],
-)
-def test_a_map_that_says_too_little_is_refused_in_one_line(tmp_path, change, said):
-    write_disc(tmp_path / "map.fits")
-    with fits.open(tmp_path / "map.fits", mode="update") as units:
-        for key, value in change.items():
-            if value is None:
-                del units[0].header[key]
-            else:
-                units[0].header[key] = value
-    with pytest.raises(InputError) as error:
-        read_diffuse_map(tmp_path / "map.fits")
-    assert said in str(error.value)
-    assert "\n" not in str(error.value)
-
-
 @pytest.mark.parametrize("content", [b"", b"no FITS", b"SIMPLE  =                    T"])
 def test_a_file_that_is_no_map_is_refused_in_one_line(tmp_path, content):
     (tmp_path / "map.fits").write_bytes(content)

@@ -252,23 +252,11 @@ def test_a_field_near_the_sun_is_refused_and_a_run_goes_on_with_a_warning(simula
     assert first.min() > 0
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "said"),
-    [
-        (f'epoch_utc = "{WHEN}Z"\n', "", "needs a date; write [sky] epoch_utc"),
-        (
-            "[background]\n",
-            "[background]\nelectrons_per_px = 3\n",
-            "electrons_per_px and zodiacal; write one",
-        ),
-    ],
-)
-def test_a_bench_file_that_cannot_have_it_is_refused(tmp_path, before, after, said):
+def test_a_bench_file_with_two_backgrounds_is_refused(tmp_path):
     path = tmp_path / "bench.toml"
-    path.write_text(BENCH.replace(before, after))
-    with pytest.raises(InputError) as error:
+    path.write_text(BENCH.replace("[background]\n", "[background]\nelectrons_per_px = 3\n"))
+    with pytest.raises(InputError, match="electrons_per_px and zodiacal; write one"):
         read_bench_file(path)
-    assert said in str(error.value)
 
 
 # Orion's bench of the thesis, 25 degrees wide. Between 17 places a side, 0.0277 apart in tangent,

@@ -23,19 +23,14 @@ from hilstar.instruments.study.prediction import (
     crossing_hz,
     shaken_finding,
     shaken_rows,
-    slew_outcomes,
 )
 from hilstar.instruments.study.predictors import (
     NEAR,
-    SLEW_DEG,
-    SLEW_S,
     predictors,
     rate_of,
     slew_attitude,
     slew_sample,
 )
-
-SLEW_PART_S = 2.0  # a tenth of the swing, from its fastest on
 
 
 def typed_rows(path, record):
@@ -53,46 +48,8 @@ def by_cell(outcomes):
 
 
 @pytest.fixture(scope="module")
-def outcomes():
-    return by_cell(slew_outcomes(SLEW_PART_S))
-
-
-def test_holding_costs_the_rate_times_the_age(outcomes):
-    """Three axes swing at up to 2 pi 3 deg / 20 s each; the age is the latency and half a sample
-    on the mean.
-    """
-    fastest_arcsec_s = math.sqrt(3) * 2 * math.pi * SLEW_DEG / SLEW_S * 3600
-    for ms in LATENCIES_MS:
-        found = outcomes["hold", USUAL_HZ, ms]
-        assert found.worst_arcsec < fastest_arcsec_s * (ms + 1000 / USUAL_HZ) / 1e3 * 1.1
-        assert found.rms_arcsec > 0.3 * fastest_arcsec_s * ms / 1e3
-
-
-def test_a_rate_predicts_better_than_holding_and_worse_the_longer_it_has_to(outcomes):
-    own = "linear, by the sample's rate"
-    errors = [outcomes[own, USUAL_HZ, ms].rms_arcsec for ms in LATENCIES_MS]
-    assert errors == sorted(errors)
-    for ms in LATENCIES_MS:
-        assert (
-            outcomes[own, USUAL_HZ, ms].rms_arcsec < outcomes["hold", USUAL_HZ, ms].rms_arcsec / 3
-        )
-
-
-@pytest.fixture(scope="module")
 def shaken():
     return {(s.way, s.packets, s.jitter_hz): s for s in shaken_rows(quick=True)}
-
-
-def test_a_rate_amplifies_a_vibration_by_its_phase_over_the_age(shaken):
-    """What is shown, 1 + i x of a wave, and what is true, exp(i x), for x = 2 pi f age; ages
-    within 5 ms of their mean.
-    """
-    for hz in (2.0, 5.0, 10.0, 14.0):
-        x = math.tau * hz * USUAL_MS / 1e3
-        assert shaken["rate", "with rates", hz].gain == pytest.approx(math.hypot(1, x), rel=0.05)
-        assert shaken["newest", "with rates", hz].residual == pytest.approx(
-            2 * math.sin(x / 2), rel=0.1
-        )
 
 
 def test_auto_is_the_rate_where_vibrations_are_slow_and_damps_where_they_are_fast(shaken):

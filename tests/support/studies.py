@@ -76,16 +76,18 @@ class WholeStudy:
         assert_whole(found, known_charts)
         return found
 
-    def reported(self, name: str, known_charts: Collection[str], measured: Any) -> Studied:
+    def reported(
+        self, name: str, known_charts: Collection[str], measured: Any, part: Any = None
+    ) -> Studied:
         """What a study of times reports of what it has measured, on an idle machine; on a busy one
-        it declines.
+        it declines, by all of that or a `part`.
         """
         study = module_of(name)
         folder = self.directories.mktemp(name)
         found = Studied(folder, *study.report(folder, with_load(measured, IDLE)))
         assert_whole(found, known_charts)
         assert found.right is True
-        assert_declines(study, self.directories.mktemp(f"{name}_busy"), measured)
+        assert_declines(study, self.directories.mktemp(f"{name}_busy"), part or measured)
         return found
 
 

@@ -207,16 +207,21 @@ def row_lateness(file: BenchFile) -> FloatArray:
     return np.asarray(REFRESH_HZ * (begin_s - screen_late_s))
 
 
-def stripe_findings(directory: Path) -> list[str]:
-    """Write `stripes.csv` and its chart; its finding. Raises InputError."""
+def measure_stripes() -> list[StripePoint]:
+    """The rows of every case."""
     points: list[StripePoint] = []
     for case in STRIPE_CASES:
         points += stripe_points(case)
+    return points
+
+
+def stripe_findings(points: Sequence[StripePoint], directory: Path) -> list[str]:
+    """Write `stripes.csv` and its chart; its finding. Raises InputError."""
     write_rows(directory / "stripes.csv", points)
     return [draw_stripes(directory / "stripes", points)]
 
 
-def stripe_depth(points: list[StripePoint], whole: bool) -> float:
+def stripe_depth(points: Sequence[StripePoint], whole: bool) -> float:
     """The largest departure of a row from the mean light, of exposures of whole refreshes or
     others.
     """
@@ -227,7 +232,7 @@ def stripe_depth(points: list[StripePoint], whole: bool) -> float:
     return depth
 
 
-def draw_stripes(path: Path, points: list[StripePoint]) -> str:
+def draw_stripes(path: Path, points: Sequence[StripePoint]) -> str:
     """The chart of the cases; its finding."""
     off = max(abs(point.light - point.foretold) for point in points)
     whole = stripe_depth(points, True)
@@ -649,13 +654,14 @@ def measure_slews(quick: bool = False) -> list[TimingOutcome]:
 
 @dataclass(frozen=True, slots=True)
 class TimingMeasured:
-    """Every compensation at every rate with the work of others meanwhile, and the stars of the
-    beat's exposures.
+    """Every compensation at every rate with the work of others meanwhile, the stars of the beat's
+    exposures, and the rows of a rolling shutter.
     """
 
     outcomes: Sequence[TimingOutcome]
     load: Load
     beats: Sequence[BeatPoint]
+    stripes: Sequence[StripePoint]
 
 
 def run(directory: Path, quick: bool = False) -> Judged:
@@ -666,10 +672,11 @@ def run(directory: Path, quick: bool = False) -> Judged:
 
 
 def measure(quick: bool) -> TimingMeasured:
-    """The slews, and the exposures that beat with the refresh."""
+    """The slews, the exposures that beat with the refresh, and those of a rolling shutter."""
     others = OtherWork()
     outcomes = measure_slews(quick)
-    return TimingMeasured(outcomes, others.load(), measure_beat(quick))
+    load = others.load()
+    return TimingMeasured(outcomes, load, measure_beat(quick), measure_stripes())
 
 
 def report(directory: Path, measured: TimingMeasured) -> Judged:
@@ -682,7 +689,7 @@ def report(directory: Path, measured: TimingMeasured) -> Judged:
         if outcome.rate_deg_s == QUICK_RATES_DEG_S[0]:
             lines.append(line_of(outcome))
     lines += beat_findings(measured.beats, directory)
-    lines += stripe_findings(directory)
+    lines += stripe_findings(measured.stripes, directory)
     return load.judged(lines)
 
 

@@ -15,10 +15,12 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import printable
 from hilstar.basics.notices import Notices
 from hilstar.basics.rotation import to_matrix, to_radec_roll_deg, turn_text
+from hilstar.server.bench.config import Tracker
 from hilstar.server.bench.frame import Bench
 from hilstar.server.pacer import Shown
 from hilstar.sky.catalog import star_names
 from hilstar.sky.constellations import constellation_of
+from hilstar.sky.stars import Stars
 
 POINTING = "points-at"
 LINE_ENDS = (
@@ -31,7 +33,8 @@ class Pointing:
     """Tells of a run's first attitude, while this is open. `see` costs a frame one comparison."""
 
     def __init__(self, bench: Bench, notices: Notices) -> None:
-        self._bench = bench
+        self._tracker = bench.config.tracker
+        self._stars = bench.stars
         self._notices = notices
         self._q_icrs_to_cam: FloatArray | None = None
         self._come = threading.Event()
@@ -48,7 +51,8 @@ class Pointing:
         self._come.wait()
         if self._q_icrs_to_cam is not None and not self._closed:
             self._notices.begin(
-                POINTING, f"{pointing_text(self._bench, self._q_icrs_to_cam)}: {LINE_ENDS}"
+                POINTING,
+                f"{pointing_text(self._tracker, self._stars, self._q_icrs_to_cam)}: {LINE_ENDS}",
             )
 
     def __enter__(self) -> Self:
@@ -61,7 +65,7 @@ class Pointing:
         self._thread.join()
 
 
-def pointing_text(bench: Bench, q_icrs_to_cam: FloatArray) -> str:
+def pointing_text(tracker: Tracker, stars: Stars, q_icrs_to_cam: FloatArray) -> str:
     """Right ascension, declination and roll of an attitude (4,), and the brightest star in the
     tracker's field.
     """
@@ -70,10 +74,9 @@ def pointing_text(bench: Bench, q_icrs_to_cam: FloatArray) -> str:
     roll = turn_text(roll_deg, 3)
     text = f"the first attitude points at RA {ra}, Dec {dec_deg:+.3f}, roll {roll} deg"
     matrix = to_matrix(q_icrs_to_cam)
-    star = _brightest_in_view(bench, matrix)
+    star = _brightest_in_view(tracker, stars, matrix)
     if star is None:
         return f"{text}, in {constellation_of(matrix[2])}, where the catalogue has no star in view"
-    stars = bench.stars
     designation, name = star_names().get(int(stars.hip[star]), ("", ""))
     names = [part for part in (name, designation) if part] or [
         str(stars.designations(np.array([star]))[0])
@@ -83,12 +86,10 @@ def pointing_text(bench: Bench, q_icrs_to_cam: FloatArray) -> str:
     return f"{text}; the brightest star in view is {called}, V {stars.v_mag[star]:.2f}, in {where}"
 
 
-def _brightest_in_view(bench: Bench, matrix: FloatArray) -> int | None:
+def _brightest_in_view(tracker: Tracker, stars: Stars, matrix: FloatArray) -> int | None:
     """The place of the brightest star of the catalogue in the tracker's field; None where none
     is there.
     """
-    tracker = bench.config.tracker
-    stars = bench.stars
     width, height = (
         0.5 * pixels * tracker.pixel_pitch_um * 1e-3 / tracker.focal_length_mm
         for pixels in tracker.resolution_px

@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from hilstar.optics.sprites import SPRITE_DTYPE, FrameLight
 from hilstar.sky.catalog import plain_catalog
 from hilstar.sky.stars import Stars, make_stars
 
 
-def stars_at(vectors: np.ndarray, electrons_per_s: np.ndarray) -> Stars:
-    """Stars of 5000 K in the directions `vectors` (n, 3), ICRS."""
+def stars_at(
+    vectors: np.ndarray,
+    electrons_per_s: np.ndarray,
+    v_mag: npt.ArrayLike = 0.0,
+    hip: npt.ArrayLike | None = None,
+) -> Stars:
+    """Stars of 5000 K in the directions `vectors` (n, 3), ICRS; numbered from 0 on without `hip`."""
     n = len(vectors)
     zero = np.zeros(n)
-    catalog = plain_catalog(
-        "HIP",
-        n,
-        {"hip": np.arange(n, dtype=np.int32), "v_mag": zero, "ra_deg": zero, "dec_deg": zero},
-    )
+    columns: dict[str, npt.NDArray[np.generic]] = {
+        "hip": np.asarray(range(n) if hip is None else hip, dtype=np.int32),
+        "v_mag": zero + np.asarray(v_mag, dtype=float),
+        "ra_deg": zero,
+        "dec_deg": zero,
+    }
+    catalog = plain_catalog("HIP", n, columns)
     vectors = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
     return make_stars(catalog, vectors, np.full(n, 5000.0), electrons_per_s)
 

@@ -61,7 +61,7 @@ def test_a_budget_is_of_a_bench_and_a_centroider_and_may_be_drawn(tmp_path):
     (tmp_path / "bench.toml").write_text(bench_text({"render": render}))
     words = ("budget", "bench.toml", "--centroider", "box5", "--json")
     told = json.loads(run_hilstar_here(*words, cwd=tmp_path).stdout)
-    assert told["centroider"] == "box5"
+    assert (told["centroider"], told["star"]["limit"]) == ("box5", 2.0)
     done = run_hilstar_here("budget", "bench.toml", "-o", "out", cwd=tmp_path)
     assert done.stdout.startswith("method                round with bit stealing, 8 bits\n")
     assert "[render] bit_stealing with calibration" in done.stderr

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
-from types import SimpleNamespace
+from dataclasses import replace
+from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
+from msgspec import structs
 
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.attitude.wire.source import Convention
@@ -15,6 +17,8 @@ from hilstar.optics.layers.fault_kinds import Now
 from hilstar.server.answers.answer import Answer, ReportedStar
 from hilstar.server.answers.judge import Judged, unjudged
 from hilstar.server.answers.pairing import Lit
+from hilstar.server.bench.config import parse_config
+from hilstar.server.bench.drawn import Drawn
 from hilstar.server.operator import OnScreen
 from hilstar.server.pacer import Shown
 from hilstar.server.record.ledger import TOPICS
@@ -33,15 +37,19 @@ from hilstar.server.record.ledger_records import (
     frame_record,
     raw_convention,
 )
+from tests.support.benches import SMALL_BENCH
+from tests.support.drawn import drawn, stars_at
 
 Q = (0.1, -0.5, 0.7, -0.5)
 RATE = np.array([0.01, -0.02, 0.03])
 MIN_NS, MAX_NS = -(2**63), 2**63 - 1
 
 
-def drawn(rate=RATE) -> SimpleNamespace:
-    """What was drawn in a frame."""
-    return SimpleNamespace(star_count=31, clipped_hip=(7, 8, "Moon"), capped=5, rate_cam_rad_s=rate)
+def drawn_frame(rate=RATE) -> Drawn:
+    """What was drawn in a frame: 31 stars, of which three clip and five are coarse."""
+    stars = stars_at(range(31), range(31), rate_cam_rad_s=rate)
+    levels = np.zeros((3, 4), np.uint8)
+    return drawn(levels, replace(stars, capped=5), (7, 8, "Moon"))
 
 
 def test_a_frame_s_record_has_each_of_its_figures():
@@ -60,7 +68,7 @@ def test_a_frame_s_record_has_each_of_its_figures():
         number=70,
         t_ns=1000,
         attitude=attitude,
-        drawn=drawn(),
+        drawn=drawn_frame(),
         draw_ns=200,
         predicted_swap_ns=300,
         swap_ns=310,
@@ -106,12 +114,12 @@ def test_a_frame_s_record_has_each_of_its_figures():
 
 
 def test_a_blank_frame_has_no_attitude_and_an_absurd_stamp_is_cut():
-    blank = frame_record(Shown(1, 2, None, drawn(None), swap_ns=3), 4, 0, 0)
+    blank = frame_record(Shown(1, 2, None, drawn_frame(None), swap_ns=3), 4, 0, 0)
     of_none = (blank.q, blank.rate, blank.attitude_t_ns, blank.age_ns, blank.receive_ns)
     assert of_none == (None,) * 5
     for age_ns, t_ns in ((2**63 + 9, MIN_NS), (-(2**63) - 9, MAX_NS)):
         absurd = Attitude(np.array(Q), age_ns=age_ns, stale=False)
-        record = frame_record(Shown(1, 2, absurd, drawn()), 0, 0, 0)
+        record = frame_record(Shown(1, 2, absurd, drawn_frame()), 0, 0, 0)
         assert (record.attitude_t_ns, record.age_ns) == (t_ns, MAX_NS if age_ns > 0 else MIN_NS)
 
 
@@ -226,9 +234,11 @@ def test_the_times_of_codes_in_a_ledger_s_head_are_both_or_none(text, wanted):
 )
 def test_a_head_says_by_what_its_raw_bytes_were_turned(source, frame, wanted):
     convention = Convention(scalar="last", direction="cam_to_icrs", frame=frame)
-    config = SimpleNamespace(
-        attitude=SimpleNamespace(source=source, convention=convention),
-        tracker=SimpleNamespace(q_body_to_cam=(0.5, 0.5, 0.5, 0.5)),
+    plain = parse_config(Path("bench.toml"), SMALL_BENCH)
+    config = structs.replace(
+        plain,
+        attitude=structs.replace(plain.attitude, source=source, convention=convention),
+        tracker=structs.replace(plain.tracker, q_body_to_cam=(0.5, 0.5, 0.5, 0.5)),
     )
     told = json.loads(raw_convention(config))
     if wanted == "nothing":

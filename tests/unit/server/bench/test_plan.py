@@ -5,7 +5,7 @@ within the tolerance, and what each choice adds to the worst errors of all.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
@@ -82,8 +82,7 @@ PSF = GaussianPsf((0.85, 0.85))
 
 def lit(v_mag: list[float], rates: list[float]) -> Stars:
     """Stars of these magnitudes and rates, wherever they are."""
-    stars = stars_at(np.tile([1.0, 0.0, 0.0], (len(rates), 1)), np.array(rates))
-    return replace(stars, v_mag=np.array(v_mag, np.float32))
+    return stars_at(np.tile([1.0, 0.0, 0.0], (len(rates), 1)), np.array(rates), v_mag)
 
 
 EVERY = lit([-1.4, 0.0, 0.5, 2.0], [900.0, 250.0, 160.0, 40.0])

@@ -145,6 +145,7 @@ def test_each_command_states_the_star_and_warns_once(tmp_path):
         assert (told.stdout + told.stderr).count("a star is 6.5 times as wide as the sky's") == 1
         assert (told.stdout + told.stderr).count("a panel of 62.75 um") == 1
         assert "check the units" not in told.stderr
+    for words in (drawn, ("doctor", "bench.toml")):
         found = json.loads(run_hilstar_here(*words, "--json", cwd=tmp_path).stdout)
         found = found["benches"]["bench.toml"] if words[0] == "doctor" else found
         assert found["star"]["sigma_ratio"] == pytest.approx(6.51, abs=0.01)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,13 +13,14 @@ from hilstar.basics.units import NS_PER_MS
 from hilstar.optics.layers.fault_kinds import Now, fault_of
 from hilstar.optics.layers.faults import FaultLayer
 from hilstar.server.loop import FaultyFrames
+from tests.support.drawn import drawn
 
 Q = np.array([0.5, 0.5, -0.5, 0.5])
 RATE = np.array([0.01, -0.02, 0.03])
 STEP_DEG = (0.4, -0.3, 1.0)
 # places and rates after a turn: rounding
 ROUNDING = 1e-12
-DRAWN: Any = SimpleNamespace()
+DRAWN = drawn(np.zeros((3, 4), np.uint8), clipped_hip=(26311, "Moon"))
 KINDS: dict[str, dict[str, Any]] = {
     "freeze": {},
     "drop": {},
@@ -49,21 +49,19 @@ def frames() -> FaultyFrames:
     return FaultyFrames(lambda t_ns: (), view)
 
 
-def test_only_a_frame_after_another_is_dropped_or_frozen_and_each_is_counted(frames):
-    bench: Any = SimpleNamespace(renderer=None)
-    drawn: Any = SimpleNamespace(sprites=None, clipped_hip=(26311, "Moon"))
+def test_only_a_frame_after_another_is_dropped_or_frozen_and_each_is_counted(frames, small_bench):
     assert (frames.dropped, frames.frozen, frames.has_dropped) == (0, 0, False)
     assert not frames.drops(on("drop"), 1)
-    assert frames.frozen_frame(on("freeze"), bench) is None
+    assert frames.frozen_frame(on("freeze"), small_bench) is None
     assert (frames.dropped, frames.frozen) == (0, 0)
-    frames.shown(None, drawn, attitude_at(0), 0, stays=False)
+    frames.shown(None, DRAWN, attitude_at(0), 0, stays=False)
     assert not frames.drops(None, 2)
     assert frames.drops(on("drop"), 2) and frames.drops(on("drop"), 3)
-    assert frames.frozen_frame(on("drop"), bench) is None
-    stays = frames.frozen_frame(on("freeze"), bench)
-    assert stays is not None and stays.clipped_hip == drawn.clipped_hip
+    assert frames.frozen_frame(on("drop"), small_bench) is None
+    stays = frames.frozen_frame(on("freeze"), small_bench)
+    assert stays is not None and stays.clipped_hip == DRAWN.clipped_hip
     assert (frames.dropped, frames.frozen, frames.has_dropped) == (2, 1, True)
-    frames.shown(None, drawn, attitude_at(4), 4, stays=False)
+    frames.shown(None, DRAWN, attitude_at(4), 4, stays=False)
     assert not frames.has_dropped
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
 from types import SimpleNamespace
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -14,10 +14,13 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
 from hilstar.optics.layers.fault_kinds import Now
 from hilstar.server import faults
+from hilstar.server.bench.build import load
 from hilstar.server.bench.config.attitude import FaultSettings
+from hilstar.server.bench.frame import Bench
 from hilstar.server.bench.scenario import parse_scenario
 from hilstar.server.faults import MAX_NAMES, ReplayedFaults, RunFaults, act, read_recording
 from hilstar.server.record.ledger_records import FaultRecord, FrameRecord
+from tests.support.benches import bench_text
 
 FRAME_NS = 20_000_000
 TEXT = """
@@ -56,12 +59,14 @@ class Kept:
         self.records.append(record)
 
 
-@pytest.fixture
-def bench(monkeypatch) -> Any:
-    """A bench of 50 Hz, whose faults need no preparation."""
-    view = SimpleNamespace(prepare=lambda fault: fault)
-    monkeypatch.setattr(faults, "display_view", lambda bench, scenario: view)
-    return SimpleNamespace(config=SimpleNamespace(monitor=SimpleNamespace(refresh_hz=50.0)))
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory) -> Iterator[Bench]:
+    """A bench of 50 Hz."""
+    path = tmp_path_factory.mktemp("bench") / "bench.toml"
+    tables = {"monitor": {"refresh_hz": 50.0}, "render": {"quantisation": "round"}}
+    path.write_text(bench_text(tables))
+    with load(path) as opened:
+        yield opened
 
 
 @pytest.fixture

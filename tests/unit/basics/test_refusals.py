@@ -42,11 +42,7 @@ def test_a_ledger_is_a_file_of_its_own(tmp_path):
     assert (tmp_path / "new").read_bytes() == b"kept"
 
 
-def test_a_lock_has_one_holder_and_is_no_link(tmp_path):
-    lock = lock_alone(tmp_path / "lock", "another has it")
-    assert refusal(lock_alone, tmp_path / "lock", "another has it") == f"{tmp_path}: another has it"
-    os.close(lock)
-    os.close(lock_alone(tmp_path / "lock", "another has it"))
+def test_a_lock_is_no_link(tmp_path):
     (tmp_path / "link").symlink_to(tmp_path / "target")
     assert says(refusal(lock_alone, tmp_path / "link", "held"), f"{tmp_path / 'link'}: ")
     assert not (tmp_path / "target").exists()

@@ -231,13 +231,6 @@ def test_no_exposure_and_no_light_give_the_offset_and_nothing_else():
     assert (Detector(EVERYTHING, SIZE_PX).expose_noiseless(flat_e(0.0), 0.0) == 100).all()
 
 
-def test_an_empty_field_in_a_noiseless_sensor_is_the_offset():
-    image = Detector(DetectorSettings(offset_dn=7.0), SIZE_PX).expose(
-        np.zeros(SHAPE, dtype=np.float32), 10.0, generator()
-    )
-    assert (image == 7).all()
-
-
 @pytest.mark.parametrize("kind", [np.float32, np.float64, np.int64, np.uint16])
 def test_electrons_of_every_number_type_give_the_same_image_and_stay_as_they_were(kind):
     image_e = flat_e(300.0).astype(kind)
@@ -319,16 +312,6 @@ def test_arrhenius_doubles_over_the_textbook_interval():
     )
     second_order = (interval_k / 293.0) ** 2
     assert warmer / colder == pytest.approx(2.0, rel=second_order)
-
-
-def test_temperature_acts_on_dark_frames():
-    settings = DetectorSettings(
-        gain_e_per_dn=1.0, bits=16, dark_e_per_s=203.0, dark_law="ccd47-20", temperature_k=273.0
-    )
-    image = Detector(settings, SIZE_PX).expose(flat_e(0.0), 10.0, generator())
-    expected_e = 2030.0 * e2v_dark("ccd47-20", 273.0) / e2v_dark("ccd47-20", 293.0)
-    assert expected_e < 0.2 * 2030.0
-    assert image.mean() == pytest.approx(expected_e, abs=SIGMAS * math.sqrt(expected_e / PIXELS))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])

@@ -389,13 +389,19 @@ def test_a_time_of_telemetry_beyond_64_bits_is_refused_on_either_side(csv_of, t_
 
 
 @pytest.mark.parametrize(
-    ("columns", "is_named"), [("wx,wy,wz", True), ("gyro_x,gyro_y", False), ("p,q,r", True)]
+    ("columns", "is_named"),
+    [
+        ("wx,wy,wz", True),
+        ("omega_x,omega_y,omega_z", True),
+        ("gyro_x,gyro_y,gyro_z", True),
+        ("p,q,r", True),
+        ("gyro_x,gyro_y", False),
+        ("rx,ry,rz,wx,wy,wz", False),
+    ],
 )
 def test_three_columns_like_rates_of_another_program_are_named(csv_of, columns, is_named):
     cells = ",".join("0" for _ in columns.split(","))
     text = f"t_s,qw,qx,qy,qz,{columns}\n0,{Q},{cells}\n0.1,{Q},{cells}\n"
-    found = open_log(csv_of(text))
-    assert (
-        any(f"columns {columns.replace(',', ', ')} are not used" in line for _, line in found.told)
-        is is_named
-    )
+    told = "\n".join(line for _, line in open_log(csv_of(text)).told)
+    assert (f"columns {columns.replace(',', ', ')} are not used" in told) is is_named
+    assert ("rates are named rx,ry,rz" in told) is is_named

@@ -69,6 +69,15 @@ def test_an_array_that_was_cut_off_between_objects_is_read_and_that_is_said(path
     )
 
 
+@pytest.mark.parametrize(("begin", "between"), [("[", ","), ("", "\n")])
+def test_an_object_that_the_file_s_end_cuts_is_left_out_and_said(path, begin, between) -> None:
+    text = begin + between.join(map(json.dumps, ROWS))
+    path.write_text(text[: text.rindex('], "note"')])
+    log = open_log(path)
+    assert len(log.samples) == len(ROWS) - 1
+    assert dict(log.told)["log-cut"].startswith("the last object has no end")
+
+
 def test_zeros_and_rows_marked_invalid_are_left_out_of_an_array(path: Path) -> None:
     unset = {"t_ns": -2, "q": [float("nan")] * 4}
     lost = {"t_ns": 10**9, "q": [1, 0, 0, 0], "valid": False}

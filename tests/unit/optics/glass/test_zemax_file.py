@@ -253,12 +253,6 @@ def test_vignetting_factors_shift_and_compress():
     assert not lens.fields[0].is_vignetted
 
 
-def test_utf_16_is_read():
-    assert focal_length_mm(read_zemax(zmx().decode().encode("utf-16"))) == pytest.approx(
-        FOCAL_MM, abs=TOLERANCE_MM
-    )
-
-
 @pytest.mark.parametrize("line", ["CURV 0.01", "DISZ 3", "GLAS N-F2 0 0", "CONI -1"])
 def test_a_surface_s_line_may_stand_twice_alike(line):
     assert len(read_zemax(zmx(more={2: [f"  {line}"] * 2})).surfaces) == 4

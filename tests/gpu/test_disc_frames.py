@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,7 +23,7 @@ from hilstar.instruments.simulate.twin import Twin
 from hilstar.instruments.verify.measure import Comparison
 from hilstar.optics.camera import Camera, Lens
 from hilstar.optics.extended import DiscLight, DiscView, LightMap, Pose, Shear, disc_lights
-from hilstar.optics.layers.bodies import BodyLayer
+from hilstar.optics.layers.bodies import BodyLayer, DiscDrawing, past_discs
 from hilstar.optics.layers.layers import light_of, sky_layers
 from hilstar.optics.layers.truth import brightest_in_view
 from hilstar.optics.layers.view import Canvas, View
@@ -178,16 +177,13 @@ def test_a_disc_that_others_hide_as_a_whole_is_none():
     """The Sun in a total eclipse is neither drawn nor listed, and comes back at its last
     contact.
     """
+    drawing = DiscDrawing(Canvas(CAMERA, GaussianPsf(SIGMA)))
     moon = disc_on_image(20.0, 170.0, (45.0, 41.0))
     for sun, seen in (
         (disc_on_image(19.0, 0.0, (45.5, 41.0), "Sun"), 1),
         (disc_on_image(19.0, 0.0, (47.0, 41.0), "Sun"), 2),
     ):
-        layer = BodyLayer(
-            SimpleNamespace(discs=lambda *_, sun=sun: [moon, sun]),
-            Canvas(CAMERA, GaussianPsf(SIGMA)),
-        )
-        assert len(layer.on_image(AT_START)) == seen
+        assert len(drawing.on_image([moon, sun], AT_START)) == seen
 
 
 def test_a_point_behind_a_disc_is_gone_and_one_before_it_stays(moon_bench):
@@ -201,10 +197,10 @@ def test_a_point_behind_a_disc_is_gone_and_one_before_it_stays(moon_bench):
     jupiter = first + moon_bench.moving.names.index("Jupiter")
     behind = replace(points, star=np.where(np.arange(len(points)) == moon, jupiter, points.star))
     stars.vectors[jupiter] = face.direction
-    kept = layer.unhidden(behind, stars, [face], View(q)).star
-    assert jupiter not in kept
-    nearer = replace(face, distance_km=1e12)
-    assert jupiter in layer.unhidden(behind, stars, [nearer], View(q)).star
+    distances_km = moon_bench.moving.distances_km()
+    assert jupiter not in past_discs(behind, stars, [face], distances_km).star
+    farther = replace(face, distance_km=1e12)
+    assert jupiter in past_discs(behind, stars, [farther], distances_km).star
 
 
 @pytest.mark.parametrize("radius_px", [3.0, 25.0])

@@ -6,26 +6,26 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tests.support.benches import SMALL_BENCH
-from tests.support.commands import HILSTAR
-from tests.support.waiting import PATIENCE_S
+from tests.support.commands import run_started
 
 LOOK = """
 import hilstar, json, pathlib, sys
 from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.display.render.context import described
 found = {}
 for codes in ("round", "dither", "exact", "temporal", "auto"):
     pathlib.Path("bench.toml").write_text(sys.argv[1] + f'\\n[render]\\nquantisation = "{codes}"\\n')
     with hilstar.load("bench.toml") as bench:
         lit = int((bench.frame(from_radec_roll_deg(84.0, -1.0, 0.0)).levels > 0).sum())
         found[codes] = [bench.renderer.gl_version[:3], bench.renderer.path, bench.config.render.quantisation, lit]
-print(json.dumps(found))
+print(json.dumps([found, described()]))
 """
 WITH_COMPUTE = {
     "round": "CPU",
@@ -36,18 +36,12 @@ WITH_COMPUTE = {
 WITHOUT = {"round": "CPU", "dither": "points", "exact": "NumPy", "temporal": "NumPy"}
 
 
-def at_version(version: str, command: list[str], folder, way: str = "") -> str:
+def at_version(version: str, program: str, *words: str, folder: Path, way: str = "") -> Any:
+    """What a program prints as JSON."""
     environment = os.environ | {"MESA_GL_VERSION_OVERRIDE": version, "HILSTAR_DRAW": way}
-    ran = subprocess.run(
-        command,
-        capture_output=True,
-        text=True,
-        cwd=folder,
-        env=environment,
-        timeout=PATIENCE_S,
-        check=True,
-    )
-    return ran.stdout
+    ran = run_started([sys.executable, "-c", program, *words], folder, env=environment)
+    assert ran.returncode == 0, ran.stderr
+    return json.loads(ran.stdout)
 
 
 @pytest.mark.usefixtures("on_llvmpipe")
@@ -56,12 +50,14 @@ def at_version(version: str, command: list[str], folder, way: str = "") -> str:
     [("3.3", WITHOUT), ("4.2", WITHOUT), ("4.3", WITH_COMPUTE), ("4.5", WITH_COMPUTE)],
 )
 def test_the_newest_version_is_taken_and_each_path_is_named(tmp_path, version, paths):
-    found = json.loads(at_version(version, [sys.executable, "-c", LOOK, SMALL_BENCH], tmp_path))
+    found, doctor_s_line = at_version(version, LOOK, SMALL_BENCH, folder=tmp_path)
     assert {codes: path for codes, (_, path, _, _) in found.items() if codes != "auto"} == paths
     assert {shown for shown, _, _, _ in found.values()} == {version}
     assert all(lit > 0 for _, _, _, lit in found.values())
     _, path, chosen, _ = found["auto"]
     assert path == paths[chosen]
+    exact = "compute shaders" if paths == WITH_COMPUTE else "NumPy (slow"
+    assert f"exact and temporal by {exact}" in doctor_s_line
 
 
 APART = """
@@ -99,15 +95,8 @@ OTHER = {"round": 0.0, "dither": 1e-3, "exact": 0.03}
 
 @pytest.mark.usefixtures("on_llvmpipe")
 @pytest.mark.parametrize("version", ["3.3", "4.5"])
-def test_stars_of_three_primaries_have_the_oracle_s_codes(tmp_path, version):
+def test_stars_of_three_primaries_have_the_oracle_s_codes(version):
     """By points, for on the CPU both are the same code."""
-    found = json.loads(at_version(version, [sys.executable, "-c", APART], Path.cwd(), "gl"))
+    found = at_version(version, APART, folder=Path.cwd(), way="gl")
     for codes, (other, most, lit) in found.items():
         assert lit > 5000 and other <= OTHER[codes] * lit and most <= 1, codes
-
-
-@pytest.mark.usefixtures("on_llvmpipe")
-@pytest.mark.parametrize(("version", "exact"), [("3.3", "NumPy (slow"), ("4.5", "compute shaders")])
-def test_doctor_says_by_what_codes_are_chosen(tmp_path, version, exact):
-    said = at_version(version, [*HILSTAR, "doctor"], tmp_path)
-    assert f"exact and temporal by {exact}" in said

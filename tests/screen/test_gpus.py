@@ -9,7 +9,7 @@ import pytest
 
 from hilstar.display.render.context import gpus
 from tests.support.benches import SCREEN_BENCH, still_log
-from tests.support.commands import run_hilstar
+from tests.support.commands import run_hilstar, run_hilstar_here
 from tests.support.ledgers import read_run
 from tests.support.x11.screens import xvfb
 
@@ -23,8 +23,9 @@ def softpipe_screen(tmp_path_factory):
         yield running
 
 
-def test_doctor_names_the_gpu_of_a_window_and_the_headless_one(screen):
-    ran = run_hilstar("doctor", "--json", env=screen.env)
+@pytest.mark.usefixtures("screen_here")
+def test_doctor_names_the_gpu_of_a_window_and_the_headless_one():
+    ran = run_hilstar_here("doctor", "--json")
     checks = {check["name"]: check["detail"] for check in json.loads(ran.stdout)["checks"]}
     name = gpus()[0].renderer
     assert checks["gpu"] == f"headless 0: {name}; window {name}"

@@ -4,7 +4,6 @@ server, dummy driver.
 
 from __future__ import annotations
 
-import ctypes
 import json
 import signal
 import subprocess
@@ -15,19 +14,14 @@ from pathlib import Path
 import pytest
 
 from tests.support.benches import SCREEN_BENCH, still_log
-from tests.support.commands import assert_refused, run_hilstar
+from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here, typed
 from tests.support.forks import HILSTAR, Started
 from tests.support.waiting import PATIENCE_S, wait_for
+from tests.support.x11.events import client
 from tests.support.x11.screens import recorded
-from tests.support.x11.xorg import Xorg, xorg
+from tests.support.x11.xorg import Xorg
 
 OTHER_GAMMA = "1.7:1.4:1.2"
-
-
-@pytest.fixture(scope="module")
-def server(tmp_path_factory) -> Iterator[Xorg]:
-    with xorg(tmp_path_factory.mktemp("xorg")) as running:
-        yield running
 
 
 def on_dummy(folder: Path, keys: str = 'display = "DUMMY0"') -> Path:
@@ -41,23 +35,10 @@ def on_dummy(folder: Path, keys: str = 'display = "DUMMY0"') -> Path:
 def showing(server: Xorg, path: Path, *options: str) -> Iterator[subprocess.Popen]:
     """A run on the screen, its ledger growing."""
     ledger = path.parent / "run.mcap"
-    command = [
-        "replay",
-        str(path),
-        str(path.parent / "still.csv"),
-        "--force",
-        "--json",
-        "--ledger",
-        str(ledger),
-        *options,
-    ]
-    with Started(
-        [*HILSTAR, *command],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=server.env,
-    ) as process:
+    files = (path, path.parent / "still.csv", "--ledger", ledger)
+    command = [*HILSTAR, *typed("replay --force --json", *files), *options]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with Started(command, env=server.env, **pipes) as process:
         try:
             wait_for(lambda: frame_count(path) > 10 or process.poll() is not None)
             yield process
@@ -68,6 +49,14 @@ def showing(server: Xorg, path: Path, *options: str) -> Iterator[subprocess.Pope
                     process.communicate(timeout=PATIENCE_S)
                 finally:
                     process.kill()
+
+
+def refusal_here(path: Path) -> str:
+    """The line by which the gate of this process's display refuses a bench."""
+    result = run_hilstar_here("replay", path, path.parent / "still.csv")
+    assert result.returncode == 3, result.stderr
+    assert "Traceback" not in result.stderr
+    return result.stderr.splitlines()[-1]
 
 
 def frame_count(path: Path) -> int:
@@ -91,42 +80,31 @@ def test_the_ramp_is_straight_while_the_bench_runs_and_given_back_after_a_signal
     server.xrandr("--output", "DUMMY0", "--gamma", "1:1:1")
 
 
-def test_swaps_that_do_not_wait_for_a_known_refresh_are_refused(server, tmp_path):
-    path = on_dummy(tmp_path)
-    result = run_hilstar("replay", path, tmp_path / "still.csv", env=server.env)
-    assert result.returncode == 3, result.stderr
-    assert (
-        "vertical sync" in result.stderr
-        and "--force" in result.stderr
-        and "Traceback" not in result.stderr
-    )
+def test_swaps_that_do_not_wait_for_a_known_refresh_are_refused(here, tmp_path):
+    line = refusal_here(on_dummy(tmp_path))
+    assert "vertical sync" in line and "--force" in line
 
 
-def test_the_monitor_that_is_named_is_the_one_that_is_filled(server, tmp_path):
-    server.xrandr("--output", "DUMMY1", "--mode", "800x600", "--right-of", "DUMMY0")
+def test_the_monitor_that_is_named_is_the_one_that_is_filled(here, tmp_path):
+    here.xrandr("--output", "DUMMY1", "--mode", "800x600", "--right-of", "DUMMY0")
     try:
-        listed = run_hilstar("doctor", "--json", env=server.env)
-        detail = next(
-            c["detail"] for c in json.loads(listed.stdout)["checks"] if c["name"] == "display"
-        )
+        listed = run_hilstar_here("doctor", "--json")
+        checks = {check["name"]: check["detail"] for check in json.loads(listed.stdout)["checks"]}
+        detail = checks["display"]
         assert "DUMMY0, 640 x 480, 60 Hz" in detail and "DUMMY1, 800 x 600" in detail
         path = on_dummy(tmp_path, 'display = "dummy1"')
         path.write_text(
             path.read_text().replace("resolution_px = [640, 480]", "resolution_px = [800, 600]")
         )
-        with showing(server, path):
-            pass
+        with showing(here, path) as process:
+            process.terminate()
+            _, said = process.communicate(timeout=PATIENCE_S)
         assert frame_count(path) > 10
-        warned = run_hilstar(
-            "replay", path, tmp_path / "still.csv", "--force", "--stop", "0.2", env=server.env
-        )
-        assert "other displays, DUMMY0" in warned.stderr and "X screen of its own" in warned.stderr
+        assert "other displays, DUMMY0" in said and "X screen of its own" in said
         wrong = on_dummy(tmp_path, 'display = "DUMMY1"')
-        result = run_hilstar("replay", wrong, tmp_path / "still.csv", env=server.env)
-        assert result.returncode == 3
-        assert "800 x 600" in result.stderr
+        assert "800 x 600" in refusal_here(wrong)
     finally:
-        server.xrandr("--output", "DUMMY1", "--off")
+        here.xrandr("--output", "DUMMY1", "--off")
 
 
 @pytest.mark.parametrize(("wanted_hz", "shown_hz"), [(60, 59.94), (120, 119.88), (75, 59.94)])
@@ -157,14 +135,12 @@ def test_x11_is_used_where_the_session_says_wayland(server, tmp_path):
     assert result.returncode == 0, result.stderr
 
 
-def test_a_display_that_another_one_mirrors_is_refused(server, tmp_path):
-    server.xrandr("--output", "DUMMY1", "--mode", "640x480", "--same-as", "DUMMY0")
+def test_a_display_that_another_one_mirrors_is_refused(here, tmp_path):
+    here.xrandr("--output", "DUMMY1", "--mode", "640x480", "--same-as", "DUMMY0")
     try:
-        result = run_hilstar("replay", on_dummy(tmp_path), tmp_path / "still.csv", env=server.env)
-        assert result.returncode == 3
-        assert "DUMMY1 mirrors this one" in result.stderr
+        assert "DUMMY1 mirrors this one" in refusal_here(on_dummy(tmp_path))
     finally:
-        server.xrandr("--output", "DUMMY1", "--off")
+        here.xrandr("--output", "DUMMY1", "--off")
 
 
 def test_a_display_that_is_unplugged_and_returns_is_filled_again(server, tmp_path):
@@ -189,44 +165,7 @@ def test_a_display_that_is_unplugged_and_returns_is_filled_again(server, tmp_pat
         server.xrandr("--output", "DUMMY1", "--off")
 
 
-def test_a_compositing_manager_is_refused(server, tmp_path):
-    """Owning the selection is what makes a compositing manager (EWMH): a real X client owns it
-    here.
-    """
-    x11 = ctypes.CDLL("libX11.so.6")
-    x11.XOpenDisplay.restype = ctypes.c_void_p
-    x11.XOpenDisplay.argtypes = [ctypes.c_char_p]
-    x11.XInternAtom.restype = x11.XDefaultRootWindow.restype = x11.XCreateSimpleWindow.restype = (
-        ctypes.c_ulong
-    )
-    x11.XInternAtom.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_int]
-    x11.XDefaultRootWindow.argtypes = [ctypes.c_void_p]
-    x11.XCreateSimpleWindow.argtypes = [
-        ctypes.c_void_p,
-        ctypes.c_ulong,
-        *[ctypes.c_int] * 2,
-        *[ctypes.c_uint] * 3,
-        *[ctypes.c_ulong] * 2,
-    ]
-    x11.XSetSelectionOwner.argtypes = [
-        ctypes.c_void_p,
-        ctypes.c_ulong,
-        ctypes.c_ulong,
-        ctypes.c_ulong,
-    ]
-    x11.XSync.argtypes, x11.XCloseDisplay.argtypes = (
-        [ctypes.c_void_p, ctypes.c_int],
-        [ctypes.c_void_p],
-    )
-    client = x11.XOpenDisplay(server.display.encode())
-    try:
-        window = x11.XCreateSimpleWindow(
-            client, x11.XDefaultRootWindow(client), 0, 0, 1, 1, 0, 0, 0
-        )
-        x11.XSetSelectionOwner(client, x11.XInternAtom(client, b"_NET_WM_CM_S0", 0), window, 0)
-        x11.XSync(client, 0)
-        result = run_hilstar("replay", on_dummy(tmp_path), tmp_path / "still.csv", env=server.env)
-    finally:
-        x11.XCloseDisplay(client)
-    assert result.returncode == 3
-    assert "compositing manager" in result.stderr
+def test_a_compositing_manager_is_refused(here, tmp_path):
+    with client(here.display) as manager:
+        manager.composite()
+        assert "compositing manager" in refusal_here(on_dummy(tmp_path))

@@ -16,7 +16,7 @@ from hilstar.display.window.randr import Randr, lit_outputs
 from hilstar.display.window.watch import PresentEvents, is_straight, presented_as
 from hilstar.server.record.ledger_records import EventRecord, run_records
 from tests.screen.test_monitors import on_dummy, showing
-from tests.support.commands import run_hilstar
+from tests.support.commands import run_hilstar, run_hilstar_here
 from tests.support.ledgers import read_run
 from tests.support.waiting import PATIENCE_S, wait_for
 from tests.unit.display.test_output_settings import HALF, edid
@@ -100,10 +100,10 @@ def test_nvidia_s_settings_are_asked_of_its_tool_where_its_driver_runs(here, mon
     assert finding.refused and 'nvidia-settings -a "[DPY:DUMMY0]/Dithering=2"' in finding.text
 
 
-def test_doctor_lists_outputs_with_their_properties_and_what_is_wrong(server):
-    with server.property("DUMMY0", "Broadcast RGB", "Limited 16:235"):
-        told = run_hilstar("doctor", env=server.env)
-        listed = json.loads(run_hilstar("doctor", "--json", env=server.env).stdout)
+def test_doctor_lists_outputs_with_their_properties_and_what_is_wrong(here):
+    with here.property("DUMMY0", "Broadcast RGB", "Limited 16:235"):
+        told = run_hilstar_here("doctor")
+        listed = json.loads(run_hilstar_here("doctor", "--json").stdout)
     assert told.returncode == 0
     assert "check   output      DUMMY0, 640 x 480; Broadcast RGB Limited 16:235" in told.stdout
     (output,) = listed["outputs"]
@@ -111,13 +111,13 @@ def test_doctor_lists_outputs_with_their_properties_and_what_is_wrong(server):
     assert 'xrandr --output DUMMY0 --set "Broadcast RGB" "Full"' in output["faults"][0]
 
 
-def test_a_wrong_setting_is_refused_and_with_force_only_told_and_recorded(server, tmp_path):
+def test_a_wrong_setting_is_refused_and_with_force_only_told_and_recorded(here, tmp_path):
     path, ledger = on_dummy(tmp_path), tmp_path / "run.mcap"
     with (
-        server.property("DUMMY0", "dithering mode", "auto"),
-        server.property("DUMMY0", "TearFree", "on"),
+        here.property("DUMMY0", "dithering mode", "auto"),
+        here.property("DUMMY0", "TearFree", "on"),
     ):
-        refused = run_hilstar("replay", path, tmp_path / "still.csv", env=server.env)
+        refused = run_hilstar_here("replay", path, tmp_path / "still.csv")
         assert (
             refused.returncode == 3 and refused.stdout == "" and "Traceback" not in refused.stderr
         )
@@ -125,7 +125,7 @@ def test_a_wrong_setting_is_refused_and_with_force_only_told_and_recorded(server
         assert "dithering mode of DUMMY0 is auto" in last
         assert last.endswith('xrandr --output DUMMY0 --set "dithering mode" "off"; or add --force')
         options = ("--force", "--json", "--stop", "0.3", "--ledger", ledger)
-        forced = run_hilstar("replay", path, tmp_path / "still.csv", *options, env=server.env)
+        forced = run_hilstar("replay", path, tmp_path / "still.csv", *options, env=here.env)
     assert forced.returncode == 0, forced.stderr
     assert (
         "dithering mode of DUMMY0 is auto" in forced.stderr

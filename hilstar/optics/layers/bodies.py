@@ -43,24 +43,30 @@ LIMB_PLACES = 24
 LATTICE = 9  # places along each side of a disc's rectangle at which clipping is tested
 
 
-class BodyLayer:
-    """Bodies wider than POINT_PX as discs; narrower ones are points among the stars."""
+class DiscDrawing:
+    """The light of discs on a canvas, nearest first, at rest, in an exposure or row by row."""
 
-    def __init__(self, moving: "MovingSky", canvas: Canvas) -> None:
+    def __init__(self, canvas: Canvas) -> None:
         self.canvas = canvas
-        self._moving = moving
         smallest_px_rad, largest_px_rad = canvas.camera.scales_px_rad()
         self._px_sr = smallest_px_rad**-2
         self._px_per_rad = largest_px_rad
         self._reach_rad = canvas.camera.field_radius_rad(canvas.psf.footprint_px / 2 + 1)
 
-    def add(self, light: FrameLight, stars: Stars, view: View) -> FrameLight:
-        """The light of the layers before, less what the discs of bodies hide, and the light of the
-        discs, the farthest first.
-        """
-        discs = self._near(view)
-        if not discs:
-            return light
+    @property
+    def wide_rad(self) -> float:
+        """The radius from which on a body is a disc."""
+        return POINT_PX / self._px_per_rad
+
+    def reach_rad(self, view: View) -> float:
+        """How far from the boresight light may be on the image at some time of a view."""
+        if not view.turns:
+            return self._reach_rad
+        away_s = view.scan.whole_s / 2 if view.exposed else view.scan.longest_s
+        return self._reach_rad + view.turn.speed_rad_s * away_s
+
+    def drawn(self, light: FrameLight, discs: list[Disc], view: View) -> FrameLight:
+        """The light with that of discs on top, the farthest first."""
         if view.exposed:
             posed = self._exposed(view)
         elif view.turns:
@@ -80,22 +86,21 @@ class BodyLayer:
             if self._clips(lights, white_e_per_s):
                 over_white.append(disc.name)
         return replace(
-            self.unhidden(light, stars, discs, view),
-            extended=tuple(extended),
-            discs=tuple(names),
-            over_white=tuple(over_white),
+            light, extended=tuple(extended), discs=tuple(names), over_white=tuple(over_white)
         )
 
-    def on_image(self, view: View) -> list[Disc]:
-        """Discs that touch the image of a camera at rest, nearest first."""
+    def on_image(self, discs: list[Disc], view: View) -> list[Disc]:
+        """Those of some discs that touch the image of a camera at rest, and that no nearer ones
+        hide.
+        """
         camera = self.canvas.camera
         icrs_to_image = view.icrs_to_image(camera)
-        discs = []
-        for disc in self._near(view):
+        touching = []
+        for disc in seen_discs(discs):
             light = DiscLight(disc, icrs_to_image, camera, self.canvas.psf)
             if light.region(camera.resolution_px) is not None:
-                discs.append(disc)
-        return discs
+                touching.append(disc)
+        return touching
 
     def alone(self, disc: Disc, view: View) -> tuple[ExtendedLight, ...]:
         """The light of a disc that nothing covers, at rest."""
@@ -115,72 +120,6 @@ class BodyLayer:
             discs.append(Disc("", ahead, distance_km, 1.0, 1.0, ahead, -ahead, "lambert"))
         lights = self._lights(discs, self._still(np.eye(3)))
         return tuple(itertools.chain.from_iterable(lights))
-
-    def unhidden(
-        self, light: FrameLight, stars: Stars, discs: list[Disc], view: View
-    ) -> FrameLight:
-        """Sprites as seen past `discs` and through their air, without those of the discs
-        themselves.
-        """
-        which = light.star
-        first = len(stars) - len(self._moving.names)
-        through = np.ones(len(which))
-        directions = stars.directions(which)
-        # Bodies hide only what is farther away. Satellites are left alone: `SatelliteLayer` adds
-        # those that nothing hides.
-        satellite = np.flatnonzero((which >= len(stars) - len(stars.bodies)) & (which < first))
-        point = np.flatnonzero(which >= first)
-        far_km = np.empty(0)
-        if len(point):
-            distances_km = self._moving.distances_km(*view.observer)
-            far_km = distances_km[which[point] - first]
-        for disc in discs:
-            sine = math.sin(disc.radius_rad) * (1 + AIR_TOP * disc.air_radii)
-            # more than a cosine rounds
-            reach_rad = math.asin(min(1.0, sine)) + 1e-7
-            near = directions @ disc.direction > np.cos(reach_rad)
-            near[point[far_km <= disc.distance_km]] = False  # itself among them
-            near[satellite] = False
-            behind = np.flatnonzero(near)
-            if len(behind):
-                through[behind] *= disc.transmission(directions[behind])
-        itself = disc_stars(stars, (disc.name for disc in discs))
-        through[np.isin(light.star, itself)] = 0.0
-        is_shown = through >= HIDDEN
-        if is_shown.all() and (through == 1).all():
-            return light
-        data = light.data[is_shown]
-        data["electrons_per_s"] *= through[is_shown].astype(np.float32)
-        return replace(
-            light,
-            data=data,
-            star=light.star[is_shown],
-            x_px=light.x_px[is_shown],
-            y_px=light.y_px[is_shown],
-        )
-
-    def _near(self, view: View) -> list[Disc]:
-        """Discs that may be on the image at some time of a view, and that no other hides,
-        nearest first.
-        """
-        reach_rad = self._reach_rad
-        wide_rad = POINT_PX / self._px_per_rad
-        if view.turns:
-            away_s = view.scan.whole_s / 2 if view.exposed else view.scan.longest_s
-            reach_rad += view.turn.speed_rad_s * away_s
-        axis = view.icrs_to_image(self.canvas.camera)[2]
-        discs = self._moving.discs(axis, reach_rad, wide_rad, *view.observer)
-        wide_discs = []
-        for k, disc in enumerate(discs):
-            places = disc.direction[None]
-            if k:
-                places = np.vstack([disc.direction, disc.limb(LIMB_PLACES)])
-            through = np.ones(len(places))
-            for nearer in discs[:k]:
-                through *= nearer.transmission(places)
-            if through.max() >= HIDDEN:
-                wide_discs.append(disc)
-        return wide_discs
 
     def _still(self, icrs_to_image: FloatArray) -> DiscView:
         """The camera at rest."""
@@ -270,6 +209,92 @@ class BodyLayer:
         on_image = camera.contains_px(*camera.project(places @ light.icrs_to_image.T))
         of_face = float(light.disc.radiance(places[on_image]).max(initial=0.0))
         return max(float(light.disc.radiance(rays @ light.icrs_to_image).max()), of_face)
+
+
+class BodyLayer:
+    """Bodies wider than POINT_PX as discs; narrower ones are points among the stars."""
+
+    def __init__(self, moving: "MovingSky", canvas: Canvas) -> None:
+        self.drawing = DiscDrawing(canvas)
+        self._moving = moving
+
+    def add(self, light: FrameLight, stars: Stars, view: View) -> FrameLight:
+        """The light of the layers before, less what the discs of bodies hide, and the light of the
+        discs, the farthest first.
+        """
+        discs = seen_discs(self._near(view))
+        if not discs:
+            return light
+        distances_km = self._moving.distances_km(*view.observer)
+        left = past_discs(light, stars, discs, distances_km)
+        return self.drawing.drawn(left, discs, view)
+
+    def on_image(self, view: View) -> list[Disc]:
+        """Discs that touch the image of a camera at rest, nearest first."""
+        return self.drawing.on_image(self._near(view), view)
+
+    def _near(self, view: View) -> list[Disc]:
+        """Discs that may be on the image at some time of a view, nearest first."""
+        axis = view.icrs_to_image(self.drawing.canvas.camera)[2]
+        reach_rad = self.drawing.reach_rad(view)
+        return self._moving.discs(axis, reach_rad, self.drawing.wide_rad, *view.observer)
+
+
+def seen_discs(discs: list[Disc]) -> list[Disc]:
+    """Discs, nearest first, without those that nearer ones hide."""
+    seen = []
+    for k, disc in enumerate(discs):
+        places = disc.direction[None]
+        if k:
+            places = np.vstack([disc.direction, disc.limb(LIMB_PLACES)])
+        through = np.ones(len(places))
+        for nearer in discs[:k]:
+            through *= nearer.transmission(places)
+        if through.max() >= HIDDEN:
+            seen.append(disc)
+    return seen
+
+
+def past_discs(
+    light: FrameLight, stars: Stars, discs: list[Disc], distances_km: FloatArray
+) -> FrameLight:
+    """Sprites as seen past discs and through their air, without those of the discs themselves.
+
+    The last of the stars are bodies at distances (n,).
+    """
+    which = light.star
+    first = len(stars) - len(distances_km)
+    through = np.ones(len(which))
+    directions = stars.directions(which)
+    # Bodies hide only what is farther away. Satellites are left alone: `SatelliteLayer` adds
+    # those that nothing hides.
+    satellite = np.flatnonzero((which >= len(stars) - len(stars.bodies)) & (which < first))
+    point = np.flatnonzero(which >= first)
+    far_km = distances_km[which[point] - first]
+    for disc in discs:
+        sine = math.sin(disc.radius_rad) * (1 + AIR_TOP * disc.air_radii)
+        # more than a cosine rounds
+        reach_rad = math.asin(min(1.0, sine)) + 1e-7
+        near = directions @ disc.direction > np.cos(reach_rad)
+        near[point[far_km <= disc.distance_km]] = False  # itself among them
+        near[satellite] = False
+        behind = np.flatnonzero(near)
+        if len(behind):
+            through[behind] *= disc.transmission(directions[behind])
+    itself = disc_stars(stars, (disc.name for disc in discs))
+    through[np.isin(light.star, itself)] = 0.0
+    is_shown = through >= HIDDEN
+    if is_shown.all() and (through == 1).all():
+        return light
+    data = light.data[is_shown]
+    data["electrons_per_s"] *= through[is_shown].astype(np.float32)
+    return replace(
+        light,
+        data=data,
+        star=light.star[is_shown],
+        x_px=light.x_px[is_shown],
+        y_px=light.y_px[is_shown],
+    )
 
 
 def _shear(scan: Scan, rate_cam_rad_s: FloatArray, camera: Camera) -> Shear | None:

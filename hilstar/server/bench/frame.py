@@ -333,7 +333,7 @@ class Bench:
         """Draw once with paths, with stars and with none: a driver compiles its shaders at first
         use, 60 ms on llvmpipe.
         """
-        lights = () if self._bodies is None else self._bodies.any_lights()
+        lights = () if self._bodies is None else self._bodies.drawing.any_lights()
         if self.sources.diffuse:
             lights = (*lights, LightMap(np.zeros((1, 1), dtype=np.float32), lasting=False))
         if lights:
@@ -429,7 +429,7 @@ class Bench:
         for disc in self.discs(view) if sprites.over_white else ():
             # Of a disc brighter than white, in the pixels of which it has most of the light
             if disc.name in sprites.over_white and self._bodies is not None:
-                alone = self._bodies.alone(disc, view)
+                alone = self._bodies.drawing.alone(disc, view)
                 self.renderer.draw_linear(replace(without_stars(sprites), extended=alone))
                 is_lit = self.renderer.linear() > MOST * wanted
                 if is_lit.any():

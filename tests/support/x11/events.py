@@ -88,6 +88,12 @@ class Client:
         )
         self._send(event, 0)
 
+    def composite(self) -> None:
+        """Say that a compositing manager runs on screen 0: it owns this selection (EWMH)."""
+        manager = self._x11.XInternAtom(self._display, b"_NET_WM_CM_S0", 0)
+        self._x11.XSetSelectionOwner(self._display, manager, self.cover(1, 1), 0)
+        self._x11.XSync(self._display, 0)
+
     def unmap(self) -> None:
         """Take hilstar's window off the screen."""
         self._x11.XUnmapWindow(self._display, self.window())
@@ -157,6 +163,7 @@ def client(display: str) -> Iterator[Client]:
             [pointer, number, *[ctypes.c_int] * 2, *[ctypes.c_uint] * 3, *[number] * 2],
         ),
         ("XKillClient", ctypes.c_int, [pointer, number]),
+        ("XSetSelectionOwner", ctypes.c_int, [pointer, *[number] * 3]),
         ("XSync", ctypes.c_int, [pointer, ctypes.c_int]),
     ):
         function = getattr(x11, name)

@@ -319,49 +319,6 @@ def test_a_second_sender_that_begins_at_the_first_one_s_next_count_takes_its_pla
 
 
 HERE, THERE = ("127.0.0.1", 4001), ("127.0.0.1", 4002)
-IDENTITIES = {
-    "numbers": ({"number": 1}, {"number": 2}, "showing number 1, refusing number 2"),
-    "one number": ({"number": 1}, {}, "showing number 1, refusing the one without a number"),
-    "addresses": (
-        {"address": HERE},
-        {"address": THERE},
-        "showing the one at 127.0.0.1 port 4001, refusing the one at 127.0.0.1 port 4002",
-    ),
-}
-
-
-@pytest.mark.parametrize("counts", [True, False])
-@pytest.mark.parametrize("stated", IDENTITIES)
-def test_two_senders_of_one_sky_and_one_clock_are_told_by_number_or_address(stated, counts):
-    """What no clock, count or sky tells: they are alike in all three."""
-    one, other, words = IDENTITIES[stated]
-
-    def make(t0: int) -> list[Arrival]:
-        second = Sender(counts=counts, **other).packets(t0 + 2_300_000, seconds(0, 3))
-        return Sender(counts=counts, **one).packets(t0, seconds(0, 4)) + second
-
-    run = ReceiverRun(make)
-    assert run.events == {"second-sender": 1}
-    assert (run.accepted, run.counts.refused_by["source"]) == (800, 600)
-    told = next(notice for notice in run.told if notice.kind == "second-sender")
-    assert words in told.detail and run.received_when_told <= 4
-
-
-@pytest.mark.parametrize("stated", IDENTITIES)
-@pytest.mark.parametrize("pause_s", [0.0, 0.1, 1.0])
-def test_another_number_or_address_takes_over_once_the_first_was_silent(stated, pause_s):
-    one, other, _ = IDENTITIES[stated]
-
-    def make(t0: int) -> list[Arrival]:
-        second = Sender(LYRA, **other).packets(t0, seconds(3 + pause_s, 6))
-        return Sender(**one).packets(t0, seconds(0, 3)) + second
-
-    run = ReceiverRun(make)
-    refused_s = max(STALE_AFTER_NS / NS_PER_S - pause_s, 0)
-    assert run.counts.refused == run.counts.refused_by["source"]
-    assert run.counts.refused == pytest.approx(refused_s * NS_PER_S / PERIOD_NS, abs=1)
-    assert abs(run.shown[-1] @ LYRA) > 0.999
-    assert run.events == {}
 
 
 def test_one_number_from_another_address_is_the_same_sender():
@@ -571,14 +528,10 @@ def test_one_sender_that_retargets_to_and_fro_is_one(every, how):
     "sequences",
     [
         list(range(500)) + list(range(500)),  # restarted
-        [2**32 - 400 + k for k in range(400)] + list(range(600)),  # wrapped
         list(range(1000, 0, -1)),  # counts down
         [k % 2 for k in range(1000)],
-        [k % 256 for k in range(1000)],
-        [0] * 1000,
         [7] * 1000,
         [3 * k for k in range(1000)],
-        np.random.default_rng(3).integers(0, 2**32, 1000).tolist(),
         np.random.default_rng(3).integers(0, 256, 1000).tolist(),
         np.sort(np.random.default_rng(3).integers(0, 10_000, 1000)).tolist(),  # nine in ten lost
     ],

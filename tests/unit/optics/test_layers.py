@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from hilstar.basics.rotation import from_rotation_vector, to_matrix
 from hilstar.display.render.reference import extended_image, linear_image
 from hilstar.optics.camera import Camera, Lens, bounded
 from hilstar.optics.extended import LightMap
-from hilstar.optics.layers.bodies import BodyLayer
+from hilstar.optics.layers.bodies import DiscDrawing, past_discs
 from hilstar.optics.layers.layers import light_of
 from hilstar.optics.layers.star_layer import StarLayer
 from hilstar.optics.layers.truth import (
@@ -37,6 +36,7 @@ CANVAS = Canvas(CAMERA, GaussianPsf((0.8, 0.8)))
 AT_START = View(np.array([1.0, 0.0, 0.0, 0.0]))
 AHEAD = np.array([0.0, 0.0, 1.0])
 FOOTPRINT = 5
+NO_LIGHT = join_sprites([], FOOTPRINT)
 
 
 def sky_of(directions: np.ndarray) -> tuple[Stars, object]:
@@ -62,8 +62,7 @@ def test_stars_beside_a_limb_are_dimmed_by_the_air_to_its_top():
     directions = np.column_stack([np.sin(angle), 0 * angle, np.cos(angle)])
     stars, light = sky_of(directions)
     stars = with_bodies(stars, ("Earth",), np.zeros(1))
-    layer = BodyLayer(SimpleNamespace(names=("Earth",), discs=lambda *_: [sphere]), CANVAS)
-    left = layer.unhidden(light, stars, [sphere], AT_START)
+    left = past_discs(light, stars, [sphere], np.array([distance_km]))
     tau = depth * np.sqrt(2 * np.pi * radius_km / scale_km)
     wanted = np.exp(-tau * np.exp(-np.maximum(heights_km, 0.0) / scale_km))
     wanted[heights_km < 0] = 0.0
@@ -110,16 +109,12 @@ def test_a_disc_goes_where_a_star_in_its_middle_goes(view):
         "Moon", towards, 100.0, 1.0, 1.0, np.array([0.0, 1.0, 0.0]), -towards, "lambert"
     ).of_rate(1e6)
     stars = stars_at(towards[None], np.full(1, 1e6))
-    images = []
-    for sky, layers in (
-        (stars, [StarLayer(canvas)]),
-        (
-            with_bodies(stars, ("Moon",), np.zeros(1)),
-            [BodyLayer(SimpleNamespace(names=("Moon",), discs=lambda *_: [face]), canvas)],
-        ),
-    ):
-        light = light_of(canvas, layers, sky, view)
-        images.append(linear_image(light, WIDE.resolution_px, canvas.psf))
+    none = join_sprites([], canvas.psf.footprint_px)
+    lights = (
+        light_of(canvas, [StarLayer(canvas)], stars, view),
+        DiscDrawing(canvas).drawn(none, [face], view),
+    )
+    images = [linear_image(light, WIDE.resolution_px, canvas.psf) for light in lights]
     y, x = np.indices(images[0].shape)
     middles = [(image * [x, y]).sum(axis=(1, 2)) / image.sum() for image in images]
     assert images[1].sum() == pytest.approx(images[0].sum(), rel=ROW_SHARE)
@@ -135,17 +130,12 @@ def test_a_disc_goes_where_a_star_in_its_middle_goes(view):
 
 def test_what_a_disc_hides_is_farther_than_it():
     """A body as a point behind a disc, at its distance but for a kilometre, and before it."""
-    canvas = Canvas(WIDE, GaussianPsf((0.8, 1.0)))
     face = Disc("Moon", AHEAD, 1000.0, 20.0, 20.0, np.array([0.0, 1.0, 0.0]), -AHEAD, "lambert")
     stars = with_bodies(stars_at(AHEAD[None], np.ones(1)), ("Moon", "Mars"), np.zeros(2))
     stars.vectors[1:] = AHEAD
     light = replace(sprites_at(np.full((3, 2), 40.0), np.ones(3), FOOTPRINT), star=np.arange(3))
     for far_km, shown in ((1001.0, []), (999.0, [2])):
-        moving = SimpleNamespace(
-            names=("Moon", "Mars"),
-            distances_km=lambda *_, far_km=far_km: np.array([1000.0, far_km]),
-        )
-        left = BodyLayer(moving, canvas).unhidden(light, stars, [face], AT_START)
+        left = past_discs(light, stars, [face], np.array([1000.0, far_km]))
         assert left.star.tolist() == shown
 
 
@@ -156,8 +146,7 @@ def test_a_satellite_is_left_to_its_own_layer_which_knows_what_hides_it():
     stars = with_bodies(stars, ("Moon",), np.zeros(1))
     stars.vectors[1:] = AHEAD
     light = replace(sprites_at(np.full((3, 2), 40.0), np.ones(3), FOOTPRINT), star=np.arange(3))
-    moving = SimpleNamespace(names=("Moon",), distances_km=lambda *_: np.array([1000.0]))
-    left = BodyLayer(moving, CANVAS).unhidden(light, stars, [face], AT_START)
+    left = past_discs(light, stars, [face], np.array([1000.0]))
     assert left.star.tolist() == [1]
 
 
@@ -284,18 +273,6 @@ def test_a_pixel_shows_at_most_its_white_or_its_full_well_in_an_exposure(
     assert canvas.white_in(view) == pytest.approx(largest_e_per_s)
 
 
-def body_layer(discs: list[Disc], canvas: Canvas) -> tuple[BodyLayer, list[float]]:
-    """The layer of discs, and how far from the boresight each of its views looked for them."""
-    reached_rad: list[float] = []
-
-    def near(axis, reach_rad, wide_rad, *observer) -> list[Disc]:
-        reached_rad.append(reach_rad)
-        return discs
-
-    names = tuple(disc.name for disc in discs)
-    return BodyLayer(SimpleNamespace(names=names, discs=near), canvas), reached_rad
-
-
 @pytest.mark.parametrize(
     ("view", "away_s"),
     [
@@ -310,11 +287,10 @@ def test_bodies_are_looked_for_as_far_as_the_camera_turns_in_their_time(view, aw
     """A frame's light ends half of the scan and the hold after the attitude; an exposure's begins
     and ends half of its whole before and after.
     """
-    layer, reached_rad = body_layer([], Canvas(WIDE, GaussianPsf((0.8, 1.0))))
-    for seen in (AT_START, view):
-        layer.add(join_sprites([], FOOTPRINT), stars_at(np.eye(3), np.ones(3)), seen)
+    drawing = DiscDrawing(Canvas(WIDE, GaussianPsf((0.8, 1.0))))
     more_rad = float(np.linalg.norm(TURN)) * away_s
-    assert reached_rad[1] - reached_rad[0] == pytest.approx(more_rad, abs=1e-12)
+    more = drawing.reach_rad(view) - drawing.reach_rad(AT_START)
+    assert more == pytest.approx(more_rad, abs=1e-12)
 
 
 @pytest.mark.parametrize("radius_px", [3.0, 15.0])
@@ -323,11 +299,9 @@ def test_no_diffuse_light_shines_through_a_dark_body(radius_px):
     disc = Disc(
         "Moon", AHEAD, 500 / radius_px, 1.0, 1.0, np.array([0.0, 1.0, 0.0]), AHEAD, "lambert"
     )
-    layer, _ = body_layer([disc], CANVAS)
     even = LightMap(np.ones((80, 96), np.float32))
-    stars = with_bodies(stars_at(-np.eye(3), np.ones(3)), ("Moon",), np.zeros(1))
-    before = replace(join_sprites([], FOOTPRINT), extended=(even,))
-    light = layer.add(before, stars, AT_START)
+    before = replace(NO_LIGHT, extended=(even,))
+    light = DiscDrawing(CANVAS).drawn(before, [disc], AT_START)
     image = extended_image(light.extended, CAMERA.resolution_px)
     assert image[39:41, 47:49].max() < 0.01
     # the disc's area, by a pixel's width of its limb
@@ -339,12 +313,11 @@ def test_no_diffuse_light_shines_through_a_dark_body(radius_px):
 def test_a_disc_in_an_exposure_is_a_chain_of_edges_as_near_as_its_psf_is_narrow(sigma_px):
     """Poses at most 1.6 sigmas apart, and no more than one a sigma, to the next odd number."""
     disc = Disc("Moon", AHEAD, 12.0, 1.0, 1.0, np.array([0.0, 1.0, 0.0]), -AHEAD, "lambert")
-    layer, _ = body_layer([disc], Canvas(CAMERA, GaussianPsf(sigma_px)))
+    drawing = DiscDrawing(Canvas(CAMERA, GaussianPsf(sigma_px)))
     length_px = 20.0
     rate = np.array([0.0, length_px / CAMERA.focal_length_px, 0.0])
-    stars = with_bodies(stars_at(-np.eye(3), np.ones(3)), ("Moon",), np.zeros(1))
     view = View.exposure(AT_START.q_icrs_to_cam, rate, 1.0)
-    lights = layer.add(join_sprites([], FOOTPRINT), stars, view).extended
+    lights = drawing.drawn(NO_LIGHT, [disc], view).extended
     ahead = np.array([light.icrs_to_image[:, 2] for light in lights])
     places_px = np.sort(ahead[:, 0] / ahead[:, 2]) * CAMERA.focal_length_px
     length_sigma = length_px / min(sigma_px)
@@ -354,9 +327,8 @@ def test_a_disc_in_an_exposure_is_a_chain_of_edges_as_near_as_its_psf_is_narrow(
 
 
 def is_over(disc: Disc, white_e_per_s: float, canvas: Canvas, view: View = AT_START) -> bool:
-    layer, _ = body_layer([disc], replace(canvas, white_e_per_s=white_e_per_s))
-    stars = with_bodies(stars_at(-np.eye(3), np.ones(3)), ("Moon",), np.zeros(1))
-    return layer.add(join_sprites([], FOOTPRINT), stars, view).over_white == ("Moon",)
+    drawing = DiscDrawing(replace(canvas, white_e_per_s=white_e_per_s))
+    return drawing.drawn(NO_LIGHT, [disc], view).over_white == ("Moon",)
 
 
 def test_a_thin_crescent_is_over_white_by_its_lit_limb():
@@ -388,9 +360,7 @@ def test_a_small_disc_that_an_exposure_moves_is_over_white_by_the_light_of_all_i
     small = Disc("Moon", AHEAD, 500.0, 1.0, 1.0, AHEAD, -AHEAD, "uniform", 1e6)
     rate = np.array([0.0, 1.6 / CAMERA.focal_length_px, 0.0])
     view = View.exposure(AT_START.q_icrs_to_cam, rate, 1.0)
-    layer, _ = body_layer([small], CANVAS)
-    stars = with_bodies(stars_at(-np.eye(3), np.ones(3)), ("Moon",), np.zeros(1))
-    lights = layer.add(join_sprites([], FOOTPRINT), stars, view).extended
+    lights = DiscDrawing(CANVAS).drawn(NO_LIGHT, [small], view).extended
     peaks = [float(light.image.max()) for light in lights]
     assert len(peaks) == 3
     assert is_over(small, 1.2 * max(peaks), CANVAS, view)

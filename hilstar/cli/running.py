@@ -8,13 +8,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import msgspec
 import typer
 
 from hilstar.basics.errors import InputError, MachineError, without_display
 from hilstar.basics.notices import Notice, Notices
 from hilstar.basics.process.programs import Service
-from hilstar.basics.units import NS_PER_S
 from hilstar.cli.declare import option, struct, switch
 from hilstar.cli.options import (
     explain_option,
@@ -31,6 +29,7 @@ from hilstar.server.console.terminal import busy, report, say
 if TYPE_CHECKING:
     from hilstar.server.bench.bench_file import BenchFile
     from hilstar.server.bench.cameras import FieldsOfView
+    from hilstar.server.bench.config import BenchConfig
     from hilstar.server.bench.scenario import Scenario
     from hilstar.server.bench.star_size import StarSize
     from hilstar.server.console.listener import PageListener
@@ -43,6 +42,7 @@ if TYPE_CHECKING:
     from hilstar.server.pacer import FrameSink, Shown
     from hilstar.server.record.ledger import LedgerSwitch
     from hilstar.server.run_progress import Follower, Running
+    from hilstar.server.screen.screen import Screen
     from hilstar.server.summary import RunSummary
     from hilstar.server.sync import BeatSummary
 
@@ -236,19 +236,16 @@ def say_units(fields: "FieldsOfView") -> None:
         say(f"check the units: {fields.warning}")
 
 
-def say_beat(bench: Any, screen: Any) -> "BeatSummary":
+def say_beat(config: "BenchConfig", screen: "Screen | None") -> "BeatSummary":
     """The beat between the tracker's exposures and the screen's refresh, with a line where it
     matters.
     """
     from hilstar.server.sync import beat_line, beat_of
 
-    if screen is not None and screen.clock.paced_by_screen:
-        measured_hz = NS_PER_S / screen.clock.period_ns
+    if screen is None:
+        frame_beat = beat_of(config)
     else:
-        measured_hz = None
-    frame_beat = beat_of(
-        bench.config, measured_hz, () if screen is None else screen.window.modes_hz
-    )
+        frame_beat = beat_of(config, screen.clock.measured_hz, screen.window.modes_hz)
     line = beat_line(frame_beat)
     if line is not None:
         say(line)
@@ -286,7 +283,12 @@ def optional_answers(
 
     with open_answers(bench.config, bench.file.folder, notices) as source:
         answers = LiveAnswers(
-            bench, AnswerRules.of(bench.config), source, notices, ledger, screen=screen
+            bench.config.monitor,
+            AnswerRules.of(bench.config),
+            source,
+            notices,
+            ledger,
+            swap_to_light_ns=None if screen is None else screen.swap_to_light_ns,
         )
         with answers.running():
             say(f"answers: {source.endpoint}")
@@ -380,27 +382,25 @@ def run_with_faults(
 
 def end_of_run(
     summary: "RunSummary",
-    screen: Any,
-    ledger: "LedgerSwitch",
+    gone: str | None,
+    failure: str | None,
     notices: Notices,
     as_json: bool,
     strict: bool = False,
 ) -> None:
     """Print the summary of a run whose ledger is closed; exit code 1 where the ledger failed, or
-    the run is not `strict`.
+    the run is not `strict`. `gone` says why the window went away, `failure` why the ledger failed.
 
     Raises MachineError where the window went away or the GPU was lost. A run without an attitude is
     the caller's.
     """
-    if ledger.last is not None:
-        summary = msgspec.structs.replace(summary, ledger=ledger.last.summary())
     report(summary, as_json)
-    if screen is not None and screen.window.gone is not None:
-        raise MachineError(f"the run ended early: {screen.window.gone}")
+    if gone is not None:
+        raise MachineError(f"the run ended early: {gone}")
     refuse_lost_gpu(notices)
     had_attitude = summary.frames > summary.blank_frames or summary.packets.accepted > 0
     passed = not strict or not had_attitude or not summary.verdict or summary.verdict.strict
-    if ledger.failure is not None or not passed:
+    if failure is not None or not passed:
         raise typer.Exit(1)
 
 

@@ -236,7 +236,7 @@ def serve_bench(
         running.say_of_light(bench)
         beat: BeatSummary | UnsetType = UNSET
         if is_timed:
-            beat = running.say_beat(bench, screen)
+            beat = running.say_beat(bench.config, screen)
         followers = Followers(None, listener, page.control, instrument)
         with shown.outlet(
             _described(file, link),

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from msgspec.structs import replace as replaced
+
 from hilstar.basics.files import MCAP, check_ending
 from hilstar.basics.notices import Notices
 from hilstar.cli import running
@@ -156,8 +158,12 @@ class ShownRun:
     def end(self, summary: "RunSummary") -> None:
         """Print the summary, once the ledger is closed; see `running.end_of_run`."""
         options = self.options
+        ledger = self.ledger
+        if ledger.last is not None:
+            summary = replaced(summary, ledger=ledger.last.summary())
+        gone = None if self.screen is None else self.screen.window.gone
         running.end_of_run(
-            summary, self.screen, self.ledger, self.notices, options.as_json, options.strict
+            summary, gone, ledger.failure, self.notices, options.as_json, options.strict
         )
 
 

@@ -22,8 +22,8 @@ import msgspec
 from msgspec.structs import replace
 
 from hilstar.attitude.receiver import BackChannel, Traffic
-from hilstar.attitude.wire.links import StreamLink
-from hilstar.attitude.wire.packet import TimeRequest
+from hilstar.attitude.wire.links import Arrival, StreamLink
+from hilstar.attitude.wire.packet import Event, TimeRequest
 from hilstar.attitude.wire.zmq_links import Feed
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import temporary_folder
@@ -260,13 +260,20 @@ def run_heads(asked: HeadsRun, link: StreamLink, say: Say) -> dict[str, Any]:
             for k in range(len(asked.heads.names)):
                 processes.append(_head(asked, k, endpoint, folder, say))
             try:
-                _hand_on(link, feed, processes, stop)
+                _hand_on(link, feed.give, processes, stop)
                 for process in processes:
                     process.interrupt()
             finally:
                 for process in processes:
                     process.close(ENDS_S)
-    return {process.name: _told(process) for process in processes}
+    ended = {}
+    for process in processes:
+        ended[process.name] = {
+            "exit_code": process.code,
+            "restarts": process.restarts,
+            "summary": summary_of(process.output),
+        }
+    return ended
 
 
 def _head(asked: HeadsRun, k: int, endpoint: str, folder: Path, say: Say) -> HeadProcess:
@@ -300,9 +307,14 @@ def head_command(asked: HeadsRun, k: int, endpoint: str, number: int, drawn_s: f
 
 
 def _hand_on(
-    link: StreamLink, feed: Feed, processes: list[HeadProcess], stop: threading.Event
+    link: StreamLink,
+    give: Callable[[Arrival[Event]], object],
+    processes: Sequence[HeadProcess],
+    stop: threading.Event,
 ) -> None:
-    """Give what arrives to the heads, and tend them, until all have ended or a signal comes."""
+    """Give what arrives to the heads but for questions of the time, which are answered, and tend
+    the heads, until all have ended or a signal comes.
+    """
     back = BackChannel(link, Traffic())
     tended_ns = 0
     while not stop.is_set():
@@ -311,7 +323,7 @@ def _hand_on(
                 if link.two_way:
                     back.answer(arrival.event, arrival)
             else:
-                feed.give(arrival)
+                give(arrival)
         if time.monotonic_ns() - tended_ns > TEND_NS:
             tended_ns = time.monotonic_ns()
             busy = [process.tend() for process in processes]
@@ -319,11 +331,9 @@ def _hand_on(
                 return
 
 
-def _told(process: HeadProcess) -> dict[str, Any]:
-    summary = None
+def summary_of(output: bytes) -> Any:
+    """The JSON that a head printed; None where that is none."""
     with contextlib.suppress(*NOT_JSON):
-        if process.output.strip():
-            summary = msgspec.json.decode(process.output)
-        else:
-            summary = None
-    return {"exit_code": process.code, "restarts": process.restarts, "summary": summary}
+        if output.strip():
+            return msgspec.json.decode(output)
+    return None

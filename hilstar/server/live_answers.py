@@ -22,11 +22,11 @@ from hilstar.server.answers.answer import Answer, AnswerSource
 from hilstar.server.answers.judge import AnswerJudge, AnswerRules, Judged, TrackerFigures, unjudged
 from hilstar.server.answers.pairing import LitFrame, LitFrames
 from hilstar.server.answers.star_widths import AnswerWidths
-from hilstar.server.bench.frame import Bench
+from hilstar.server.bench.config import Monitor
+from hilstar.server.bench.monitor import scan_of
 from hilstar.server.pacer import Shown
 from hilstar.server.record.ledger import LedgerSwitch
 from hilstar.server.record.ledger_records import answer_record
-from hilstar.server.screen.screen import Screen
 
 POLL_S = 0.02
 FIGURES_NS = NS_PER_S // 10  # between two sets of figures while nothing comes
@@ -40,17 +40,20 @@ AGAIN_NS = 3 * NS_PER_S  # after the reader is back, a tracker's answer may take
 
 
 class LiveAnswers:
-    """A run's tracker: `figures` are the newest. Readable from any thread."""
+    """A run's tracker: `figures` are the newest. Readable from any thread.
+
+    `swap_to_light_ns` is the time from a swap to the middle row's light, None without a screen.
+    """
 
     def __init__(
         self,
-        bench: Bench,
+        monitor: Monitor,
         rules: AnswerRules,
         source: AnswerSource,
         notices: Notices,
         ledger: LedgerSwitch,
         *,
-        screen: Screen | None = None,
+        swap_to_light_ns: int | None = None,
         clock: HostClock = HOST_CLOCK,
     ) -> None:
         self.figures = TrackerFigures()
@@ -64,10 +67,10 @@ class LiveAnswers:
         self._notices = notices
         self._ledger = ledger
         self._clock = clock
-        self._light_ns = 0 if screen is None else screen.swap_to_light_ns
-        self._on_screen = screen is not None
-        period_ns = NS_PER_S / bench.config.monitor.refresh_hz
-        self._frames = LitFrames(period_ns, bench.scan.hold_s, centred=screen is None)
+        self._swap_to_light_ns = swap_to_light_ns
+        period_ns = NS_PER_S / monitor.refresh_hz
+        hold_s = scan_of(monitor).hold_s
+        self._frames = LitFrames(period_ns, hold_s, centred=swap_to_light_ns is None)
         self._judge = AnswerJudge(rules, self._frames)
         self._allowance = Allowance(MAX_JUDGED_HZ, MAX_JUDGED_HZ)
         self._too_many = 0
@@ -84,10 +87,10 @@ class LiveAnswers:
         attitude = shown.attitude
         on_screen = shown.on_screen
         is_visible = attitude is not None and not on_screen.operator and not on_screen.hidden
-        if self._on_screen:
-            host_ns = shown.swap_ns + self._light_ns
-        else:
+        if self._swap_to_light_ns is None:
             host_ns = shown.moment_ns
+        else:
+            host_ns = shown.swap_ns + self._swap_to_light_ns
         if attitude is not None and is_visible:
             q = attitude.q_icrs_to_cam
         else:

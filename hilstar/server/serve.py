@@ -5,7 +5,7 @@ frame of each attitude.
 import itertools
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 from msgspec import UNSET
@@ -222,20 +222,24 @@ def _serve_stream(
 
 
 def _pass_on(receiver: Receiver, numbers: Iterator[int], answer: Answer, middle_ns: int) -> None:
-    """Pass a valid answer of the tracker on to the sender, stamped on the sender's clock, once
-    that is known.
+    """Pass an answer of the tracker on to the sender, with the next number."""
+    packet = answer_packet(answer, middle_ns, receiver.clock_summary().offset_ms)
+    if packet is not None:
+        receiver.back.pass_on(replace(packet, sequence=next(numbers)))
+
+
+def answer_packet(answer: Answer, middle_ns: int, offset_ms: float | None) -> AnswerPacket | None:
+    """An answer of the tracker, stamped on the sender's clock, as a packet with the number 0; None
+    where it is not valid or that clock is not known.
     """
-    offset_ms = receiver.clock_summary().offset_ms
     if answer.q_icrs_to_cam is None or not answer.valid or offset_ms is None:
-        return
+        return None
     t_ns = middle_ns - round(offset_ms * NS_PER_MS)
     rate = answer.rate_cam_rad_s
     flags = protocol.ANSWER_VALID | (0 if rate is None else protocol.ANSWER_RATE_VALID)
     q = tuple(answer.q_icrs_to_cam.tolist())
     rates = (0.0, 0.0, 0.0) if rate is None else tuple(rate.tolist())
-    receiver.back.pass_on(
-        AnswerPacket(next(numbers), flags, t_ns, q, rates, answer.star_count or 0)
-    )
+    return AnswerPacket(0, flags, t_ns, q, rates, answer.star_count or 0)
 
 
 class LockstepRun:

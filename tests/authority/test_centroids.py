@@ -1,8 +1,5 @@
 """The centroider against truth: its S-curves against theory, its scatter against the propagated
 noise of the pixels.
-
-`python -m tests.authority.test_centroids` prints bias and scatter over star size and signal to
-noise.
 """
 
 from __future__ import annotations
@@ -413,32 +410,3 @@ def test_what_is_no_image_is_refused(image):
 def test_settings_that_make_no_sense_are_refused(wrong):
     with pytest.raises(InputError, match=next(iter(wrong))):
         CentroidSettings(**wrong)
-
-
-if __name__ == "__main__":
-    print(
-        "largest bias, noiseless, px; scatter (both axes) over SNR 10, 30, 100, px, and the share"
-        " found at 4 sigma"
-    )
-    print(
-        "sigma  window   bias     corrected   SNR 10            SNR 30            SNR 100          "
-        " predicted 30, 100"
-    )
-    for sigma in SIGMAS_PX:
-        for window in ("gaussian", "plain"):
-            raw = replace(window_for(sigma), window=window)
-            if window == "plain":
-                raw = replace(raw, window_radius_px=math.ceil(3 * sigma) + 1)
-            known = replace(raw, psf_sigma_px=(sigma, sigma))
-            cells = [
-                f"{sigma:5} {window:9}{np.abs(bias_px(sigma, raw)).max():.1e} "
-                f" {np.abs(bias_px(sigma, known)).max():.1e} "
-            ]
-            for signal_to_noise in (10.0, *FIRST_ORDER_SNR):
-                got = centroid_errors(sigma, signal_to_noise, known, seed=11)
-                cells.append(f"{got.scatter_px:.4f} ({100 * got.found:5.1f} %)")
-            if window == "gaussian":
-                cells += [
-                    f"{predicted_scatter_px(sigma, value, known):.4f}" for value in FIRST_ORDER_SNR
-                ]
-            print("  ".join(cells))

@@ -3,7 +3,6 @@ Poisson's own law.
 
 Nothing here looks inside the detector: flats, darks and bias frames go in, gain, noise and
 non-uniformity come out.
-`python -m tests.authority.test_photon_transfer` prints the figures.
 """
 
 from __future__ import annotations
@@ -183,13 +182,3 @@ def test_the_sampler_keeps_poissons_moments_up_to_the_largest_mean_that_is_taken
     # estimates.
     assert abs(stats.skew(counts)) < 5 * math.sqrt(6 / PIXELS)
     assert abs(stats.kurtosis(counts)) < 5 * math.sqrt(24 / PIXELS)
-
-
-if __name__ == "__main__":
-    print(CCD)
-    for figures in (photon_transfer(CCD, seed=1), dark_frames(CCD, 20.0, seed=2)):
-        for name, value in figures.items():
-            truth = math.sqrt(203.0 * 20.0) if name == "dark_shot_noise_e" else getattr(CCD, name)
-            print(
-                f"{name:20} {value:10.5g}   true {truth:10.5g}   {100 * (value / truth - 1):+.2f} %"
-            )

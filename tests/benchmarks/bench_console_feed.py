@@ -5,7 +5,6 @@ tests.benchmarks.bench_console_feed.
 from __future__ import annotations
 
 import time
-from types import SimpleNamespace
 
 import numpy as np
 
@@ -15,8 +14,9 @@ from hilstar.attitude.receiver import PacketCounts
 from hilstar.basics.resources import resource_path
 from hilstar.server.console.messages import PictureRequest, SharedMemory
 from hilstar.server.console.publisher import FramePublisher
+from hilstar.server.loop import FrameLoop
 from hilstar.server.pacer import Shown
-from hilstar.server.summary import RunTally
+from hilstar.server.run_progress import Running
 from tests.support.benches import ORION_Q
 
 FRAMES, PICTURES = 20_000, 300
@@ -29,11 +29,7 @@ def main() -> None:
         drawn = bench.draw(np.array(ORION_Q))
         levels = drawn.levels
         feed = FramePublisher(memory := SharedMemory.make(levels.nbytes))
-        feed.follow(
-            SimpleNamespace(
-                loop=SimpleNamespace(tally=RunTally()), packets=PacketCounts(), tally=RunTally()
-            )
-        )
+        feed.follow(Running(FrameLoop(bench), PacketCounts()))
         attitude = Attitude(np.array(ORION_Q), 5_000_000, False)
         base_ns = time.monotonic_ns()
         shown = [

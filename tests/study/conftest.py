@@ -8,17 +8,15 @@ an SVG takes as long as its PNG.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from functools import partial, wraps
+from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
 from hilstar.basics import charts
-from hilstar.instruments.study import sweep
 from hilstar.instruments.study.sweep import Load, OtherWork
-from tests.support.studies import SmallRun, Studied, studied
+from tests.support.studies import SmallRun, WholeStudy, times_are_watched
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -59,38 +57,12 @@ def every_chart_is_legible() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def whole_study(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Studied]:
-    """Runs a study by its command (see `studied`). README's command leaves out the tests that ask
-    for it, also by a fixture of theirs; a study's own functions are held by the others.
+def whole_study(tmp_path_factory: pytest.TempPathFactory) -> WholeStudy:
+    """Runs a study by its command, or reports what one of times has measured. README's command
+    leaves out the tests that ask for it, also by a fixture of theirs; a study's own functions are
+    held by the others.
     """
-    return partial(studied, tmp_path_factory)
-
-
-@contextmanager
-def times_are_watched() -> Iterator[None]:
-    """Whoever times works counts what others do from before the first of them to after the last."""
-    is_counted = False
-    begin, spent = OtherWork.__init__, sweep.spent
-
-    def begun(others: OtherWork) -> None:
-        nonlocal is_counted
-        is_counted = True
-        begin(others)
-
-    def ended(others: OtherWork) -> Load:
-        nonlocal is_counted
-        is_counted = False
-        return Load()
-
-    def timed(work: Callable[[], object]) -> sweep.Spent:
-        assert is_counted
-        return spent(work)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(OtherWork, "__init__", begun)
-        patch.setattr(OtherWork, "load", ended)
-        patch.setattr(sweep, "spent", timed)
-        yield
+    return WholeStudy(tmp_path_factory)
 
 
 @pytest.fixture(scope="session")

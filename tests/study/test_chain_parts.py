@@ -1,19 +1,15 @@
-"""The study of the chain in parts: exposures before a panel, times, and what is said of planted
-rows.
-"""
+"""The study of the chain in parts: exposures before a panel, errors of stars, and times."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.basics import charts
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import (
     angle_between_rad,
@@ -22,36 +18,27 @@ from hilstar.basics.rotation import (
     random_attitudes,
     to_matrix,
 )
-from hilstar.instruments.study.chain import answers, choices, measuring, run
-from hilstar.instruments.study.chain.measuring import CombinationRow, ErrorPart, StageTime
+from hilstar.instruments.study.chain import choices, measuring
 from hilstar.instruments.study.chain.tracker import (
     LOST_MAG,
     MeasuredStars,
     Off,
-    StarJudge,
+    StudyTracker,
     attitude_off_arcsec,
     off,
     within,
 )
 from hilstar.instruments.study.predictors import Movement, attitude_at
-from hilstar.instruments.study.sweep import Load, Spent
+from hilstar.instruments.study.sweep import Spent
 from hilstar.optics.scan import Scan
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.config import AttitudeSettings, parse_config
 from tests.support.benches import SMALL_BENCH, bench_text
-from tests.support.tables import csv_rows
 
 PERIOD_S = 1 / 50
 SIZE_PX = (6, 4)
 ROUNDING = 1e-9
-
-
-def bench_of(scan: Scan, exposure_s: float) -> SimpleNamespace:
-    """A bench of 50 Hz whose panel lights up so."""
-    monitor = SimpleNamespace(refresh_hz=1 / PERIOD_S)
-    config = SimpleNamespace(monitor=monitor, tracker=SimpleNamespace(exposure_s=exposure_s))
-    return SimpleNamespace(config=config, scan=scan, camera=SimpleNamespace(resolution_px=SIZE_PX))
 
 
 def turn_ahead_deg(prediction: choices.Prediction, ahead_ms: float) -> float:
@@ -225,169 +212,117 @@ def test_an_attitude_is_off_by_the_turn_of_its_stars_and_two_are_enough():
     )
 
 
-@pytest.fixture
-def planted_scene(monkeypatch):
-    """A scene of three exposures whose stars are off by planted errors, whatever is drawn; with
-    the movement and the exposure that each judge was made of.
-    """
-    made = []
+CUT = choices.ChainCombination("exact", False, 7.5, "cut")
 
-    class Judge:
-        def __init__(self, tracker, movement, seen):
-            self.movement, self.seen, self.sky = movement, seen, "sky"
-            self.lost_arcsec = 77.0
-            made.append(self)
 
-        def __len__(self):
-            return 2
+def test_the_exposures_of_a_field_at_rest_have_their_stars_at_other_places():
+    """3.37 and 4.71 px of the tracker further, by its own focal length."""
+    for rate_deg_s, step_px in ((0.0, math.hypot(3.37, 4.71)), (1.0, 0.0)):
+        movement = Movement(np.array([1.0, 0, 0, 0]), rate_deg_s)
+        turned_px = []
+        for number in range(3):
+            moved = measuring.moved_on(movement, number, 5000.0)
+            assert moved.rate_deg_s == rate_deg_s
+            turn_rad = angle_between_rad(movement.q_icrs_to_cam, moved.q_icrs_to_cam)
+            turned_px.append(5000 * turn_rad)
+        assert turned_px == pytest.approx([0.0, step_px, 2 * step_px], abs=1e-6)
 
-        def measure(self, image_e):
-            return made.index(self)
 
+def test_an_error_is_of_the_stars_of_all_exposures_and_their_attitudes_that_are_known():
     nan = math.nan
     offs = [
         Off(np.array([3.0, 77.0]), np.array([0.2, 1.0]), np.array([False, True])),
         Off(np.array([4.0, 0.0]), np.array([0.3, 0.1]), np.array([False, False])),
         Off(np.array([77.0, 77.0]), np.array([1.0, 1.0]), np.array([True, True])),
     ]
-    turns = [(3.0, 1.0), (4.0, nan), (nan, 7.0)]
-    monkeypatch.setattr(measuring, "StarJudge", Judge)
-    monkeypatch.setattr(measuring, "off", lambda shown, sky, lost_arcsec: offs[shown])
-    monkeypatch.setattr(measuring, "attitude_off_arcsec", lambda shown, sky: turns[shown])
-    monkeypatch.setattr(measuring.DrawingChain, "exposed", lambda chain, seen: seen)
-    monkeypatch.setattr(measuring.DrawingChain, "sprite_px", lambda chain: "9")
-    bench = bench_of(Scan((0, 1), 0.0, 0.0), 0.1)
-    bench.config.monitor.bits = 10
-
-    def marks(movement):
-        other = replace(CUT, quantisation="round")
-        return choices.Marks(replace(CUT, sprite="full"), CUT, other)
-
-    parts = SimpleNamespace(
-        own=bench, can_steal_bits=False, faintest_v_mag=7.5, marks=marks, bench=lambda chosen: bench
-    )
-    camera = SimpleNamespace(focal_length_px=5000.0)
-    tracker = SimpleNamespace(camera=camera, image_e=lambda light, seen: light)
-
-    def scene(rate_deg_s):
-        of = choices.ChainScene("s", "why", np.array([1.0, 0, 0, 0]), rate_deg_s)
-        return measuring.SceneMeasurement(parts, tracker, of, measuring.Rounds()), list(made)
-
-    return scene
-
-
-CUT = choices.ChainCombination("exact", False, 7.5, "cut")
-
-
-def test_exposures_begin_at_their_own_frames_and_at_rest_at_other_places(planted_scene):
-    """3.37 and 4.71 px of the tracker further, by its own focal length."""
-    for rate_deg_s, step_px in ((0.0, math.hypot(3.37, 4.71)), (1.0, 0.0)):
-        scene, judges = planted_scene(rate_deg_s)
-        begins_s = [judge.seen.begin_s for judge in judges[-3:]]
-        wanted_s = [number * PERIOD_S + 0.0037 for number in (20, 151, 325)]
-        assert begins_s == pytest.approx(wanted_s)
-        turned_px = []
-        for judge in judges[-3:]:
-            turn_rad = angle_between_rad(
-                judges[-3].movement.q_icrs_to_cam, judge.movement.q_icrs_to_cam
-            )
-            turned_px.append(5000 * turn_rad)
-        assert turned_px == pytest.approx([0.0, step_px, 2 * step_px], abs=1e-6)
-        assert scene.star_count == 6
-
-
-def test_a_row_is_of_all_exposures_and_has_its_own_marks(planted_scene):
-    scene, _ = planted_scene(0.0)
-    error = scene.error(CUT)
+    error = measuring.error_of(offs, [(3.0, 1.0), (4.0, nan), (nan, 7.0)])
     assert (error.stars, error.lost) == (6, 3)
     arcsec = math.sqrt((9 + 16 + 3 * 77**2) / 6)
     assert error.error_arcsec == pytest.approx(arcsec, rel=1e-3)
     assert error.error_mag == pytest.approx(math.sqrt((0.04 + 0.09 + 0.01 + 3) / 6), rel=1e-3)
     assert error.attitude_arcsec == pytest.approx(math.sqrt(12.5), rel=1e-3)
     assert error.roll_arcsec == pytest.approx(5.0)
-    rows = {
-        (row.quantisation, row.sprite): row for row in scene.untimed() if row.faintest_v_mag == 7.5
-    }
-    marks = {
-        key: (row.chosen, row.as_filed)
-        for key, row in rows.items()
-        if row.chosen or row.as_filed == "true"
-    }
-    assert marks == {
-        ("exact", "full"): ("default", "false"),
-        ("exact", "cut"): ("auto", "false"),
-        ("round", "cut"): ("", "true"),
-    }
-    first = rows["exact", "cut"]
-    assert (first.exposure_s, first.bits, first.bit_stealing, first.scene) == (
-        0.1,
-        10,
-        "false",
-        "s",
-    )
+
+
+def test_a_combination_is_called_by_what_chooses_it():
+    marks = choices.Marks(replace(CUT, sprite="full"), CUT, replace(CUT, quantisation="round"))
+    named = (marks.default, marks.auto, marks.as_filed)
+    words = [measuring.chosen_words(combination, marks) for combination in named]
+    assert words == ["default", "auto", ""]
+    assert measuring.chosen_words(CUT, replace(marks, default=CUT)) == "default auto"
 
 
 def test_a_still_frame_stands_for_all_unless_its_codes_change():
-    seen = SimpleNamespace(at_rest=lambda *_: "first", mean=lambda *_: "all")
-    bench = SimpleNamespace(camera=SimpleNamespace(resolution_px=SIZE_PX))
-    exposed = {}
+    alike = set()
     for rate_deg_s in (0.0, 1.0):
         movement = Movement(np.array([1.0, 0, 0, 0]), rate_deg_s)
         for method in choices.QUANTISATIONS:
-            chain = measuring.DrawingChain(replace(CUT, quantisation=method), bench, movement)
-            exposed[rate_deg_s, method] = chain.exposed(seen)
-    assert {key for key, of in exposed.items() if of == "first"} == {
-        (0.0, "round"),
-        (0.0, "dither"),
-        (0.0, "exact"),
-    }
+            if measuring.is_alike(movement, replace(CUT, quantisation=method)):
+                alike.add((rate_deg_s, method))
+    assert alike == {(0.0, "round"), (0.0, "dither"), (0.0, "exact")}
 
 
-def test_the_sides_of_sprites_are_from_the_smallest_to_the_largest():
-    def sides(*sides_px):
-        target = SimpleNamespace(sides=[SimpleNamespace(side_px=side) for side in sides_px])
-        renderer, psf = SimpleNamespace(target=target), SimpleNamespace(footprint_px=11)
-        bench = SimpleNamespace(renderer=renderer, psf=psf)
-        return measuring.DrawingChain(CUT, bench, None).sprite_px()
-
-    assert [sides(8, 6, 10), sides(8, 8), sides()] == ["6 to 10", "8", "11"]
+def test_sizes_are_told_from_the_smallest_to_the_largest():
+    assert [measuring.range_words(sizes) for sizes in ((8, 6, 10), (8, 8), (11,))] == [
+        *("6 to 10", "8", "11")
+    ]
 
 
-def test_the_stages_of_a_frame_are_its_own_and_each_frame_has_another_attitude(monkeypatch):
-    """Prediction takes 1 ms, sprites 2, codes 4 with the wait for the GPU, reading back 8."""
+def test_each_lap_has_its_own_time_and_what_the_one_before_gave(monkeypatch):
     now_ms = [0.0]
     monkeypatch.setattr(measuring.time, "perf_counter", lambda: now_ms[0] * 1e-3)
-    attitudes = []
+    given = []
 
-    def takes(ms, result=None):
-        now_ms[0] += ms
-        return result
+    def lap(ms):
+        def work(before):
+            given.append(before)
+            now_ms[0] += ms
+            return ms
 
-    def predicted(timeline, light_ns):
-        attitudes.append((timeline, light_ns))
-        return takes(1, SimpleNamespace(q_icrs_to_cam=None, rate_cam_rad_s=None))
+        return work
 
-    class Drawn:
-        levels = property(lambda drawn: takes(8))
+    assert measuring.laps_ms([lap(1), lap(2), lap(8)]) == pytest.approx((1.0, 2.0, 8.0))
+    assert given == [None, 1, 2]
 
-    bench = bench_of(Scan((0, 1), 0.0, 0.0), 0.1)
-    bench.view = lambda q, rate: None
-    bench.light = lambda view: takes(2)
-    bench.draw_sprites = lambda sprites, number: takes(3, Drawn())
-    bench.renderer = SimpleNamespace(finish=lambda: takes(1))
-    monkeypatch.setattr(measuring, "attitude_at", predicted)
-    monkeypatch.setattr(measuring.DrawingChain, "timeline", lambda chain, movement, ns: movement)
-    chain = measuring.DrawingChain(CUT, bench, Movement(np.array([1.0, 0, 0, 0]), 0.0))
-    for _ in range(3):
-        assert chain.stages_ms() == pytest.approx((1.0, 2.0, 4.0, 8.0))
-    light_ns = [ns for _, ns in attitudes]
-    assert np.diff(light_ns).tolist() == [20_000_000] * 2
+
+def test_each_frame_that_is_timed_has_another_attitude_and_its_own_moment(bench_with):
+    movement = Movement(np.array([1.0, 0, 0, 0]), 0.0)
     turns_rad = []
-    for movement, _ in attitudes:
-        turns_rad.append(angle_between_rad(np.array([1.0, 0, 0, 0]), movement.q_icrs_to_cam))
+    for frame in range(1, 4):
+        moved = measuring.nudged(movement, frame)
+        turns_rad.append(angle_between_rad(movement.q_icrs_to_cam, moved.q_icrs_to_cam))
     # 1e-7 rad about two axes, a frame; an angle of 1e-7 rad is known to a few per cent
     wanted_rad = math.sqrt(2) * 1e-7 * np.arange(1, 4)
     np.testing.assert_allclose(turns_rad, wanted_rad, rtol=0.1)
+    bench = bench_with()
+    chain = measuring.DrawingChain(CUT, bench, movement)
+    light_ns, off_rad = [], []
+    for frame in range(1, 4):
+        timeline, at_ns = chain.next_frame()
+        light_ns.append(at_ns)
+        wanted = measuring.nudged(movement, frame)
+        drawn = attitude_at(timeline, at_ns).q_icrs_to_cam
+        off_rad.append(angle_between_rad(drawn, wanted.at(at_ns)))
+    assert np.diff(light_ns).tolist() == 2 * [round(1e9 / bench.config.monitor.refresh_hz)]
+    # the study's jitter is predicted by its rate
+    assert max(off_rad) < 1e-6
+
+
+def test_the_wait_for_the_gpu_is_of_drawing_and_not_of_reading_back(bench_with, monkeypatch):
+    """A wait of 100 ms, by a clock that stands still otherwise."""
+    bench = bench_with()
+    now_s, finish = [0.0], bench.renderer.finish
+
+    def waits():
+        now_s[0] += 0.1
+        finish()
+
+    monkeypatch.setattr(measuring.time, "perf_counter", lambda: now_s[0])
+    monkeypatch.setattr(bench.renderer, "finish", waits)
+    chain = measuring.DrawingChain(CUT, bench, Movement(np.array([1.0, 0, 0, 0]), 0.0))
+    stages_ms = dict(zip(measuring.STAGES, chain.stages_ms(), strict=True))
+    assert {stage for stage, ms in stages_ms.items() if ms} == {"drawing and codes"}
+    assert chain.timed_frames == 1
 
 
 def test_places_are_within_a_margin_of_an_image_s_last_pixels():
@@ -396,28 +331,30 @@ def test_places_are_within_a_margin_of_an_image_s_last_pixels():
     assert within(x, y, (200, 100), 10.0).tolist() == [True, False, True, False, True, False]
 
 
-def test_a_star_is_judged_by_its_margin_on_detector_and_monitor():
+def test_a_star_is_seen_whole_by_its_margin_on_detector_and_monitor(tmp_path):
     """A monitor with three pixels to one of the tracker's: 10 px there are 30 here, and half a
-    sprite of 9 px.
+    sprite. Both middles are on the boresight.
     """
-    size_px = (400, 300)
-    tracker = SimpleNamespace(
-        camera=SimpleNamespace(resolution_px=(1000, 1000)),
-        geometry=SimpleNamespace(to_monitor=lambda x, y: (3 * x, 3 * y)),
-        bench=SimpleNamespace(
-            psf=SimpleNamespace(footprint_px=9), camera=SimpleNamespace(resolution_px=size_px)
-        ),
-        monitor_px_per_px=3.0,
-    )
-    judge = object.__new__(StarJudge)
-    judge.tracker = tracker
-    x = np.array([11.6, 11.4, 121.4, 121.6])
-    y = np.full(4, 40.0)
-    assert judge._inside(x, y, 10.0).tolist() == [True, False, True, False]
+    path = tmp_path / "bench.toml"
+    tables = {
+        "tracker": {"focal_length_mm": 70, "pixel_pitch_um": 15.0, "resolution_px": [121, 121]},
+        "monitor": {"resolution_px": [301, 241], "pixel_pitch_um": 25.0},
+        "collimator": {"focal_length_mm": 350},
+    }
+    path.write_text(bench_text(tables))
+    with open_bench(read_bench_file(path)) as bench, StudyTracker(bench) as tracker:
+        assert tracker.monitor_px_per_px == pytest.approx(3.0)
+        # to the end of the monitor's last pixel but its margin
+        reach_px = 150 - 10 * 3 - bench.psf.footprint_px / 2
+        beyond_px = np.array([-0.2, 0.2, -0.2, 0.2, 0])
+        x_px = 60 + np.array([-1, -1, 1, 1, 0]) * (reach_px + beyond_px) / 3
+        y_px = np.array([60.0, 60.0, 60.0, 60.0, 9.0])
+        seen = tracker.sees_around(x_px, y_px, 10.0)
+    assert seen.tolist() == [True, False, True, False, False]
 
 
 def test_times_are_a_median_its_quartiles_and_its_noise():
-    walls = [1.0, 2.0, 3.0, 4.0, 10.0]
+    walls = [4.0, 1.0, 2.0, 3.0, 10.0]
     taken = measuring.times_of(np.array([Spent(wall, 10 * wall) for wall in walls]))
     assert (taken.time_ms, taken.iqr_ms, taken.cpu_ms, taken.frames) == (3.0, 2.0, 30.0, 5)
     # the standard error of a median is 1.2533 sigma over the root of its number
@@ -425,330 +362,6 @@ def test_times_are_a_median_its_quartiles_and_its_noise():
     assert taken.noise_ms == pytest.approx(1.2533 * sigma_ms / math.sqrt(5), abs=1e-4)
     assert measuring.noise_ends_ms(4.0, 1.0) == (3.0, 5.0)
     assert measuring.noise_ends_ms(4.0, 3.0) == (2.0, 7.0)
-    assert measuring.rounded(0.123456) == 0.1235
+    assert measuring.rounded(0.123456) == 0.1235 and math.isnan(measuring.rounded(math.nan))
     assert measuring.rms_of_known([3.0, math.nan, 4.0]) == pytest.approx(math.sqrt(12.5))
     assert math.isnan(measuring.rms_of_known([math.nan]))
-
-
-ROW = CombinationRow(
-    scene="average field",
-    rate_deg_s=0.0,
-    exposure_s=0.1,
-    bits=8,
-    bit_stealing="false",
-    faintest_v_mag=7.5,
-    sprite="cut",
-    sprite_px="9",
-    smear="path",
-    prediction="rate",
-    quantisation="exact",
-    stars=30,
-    lost=0,
-    error_arcsec=1.0,
-    error_mag=0.01,
-    attitude_arcsec=0.3,
-    roll_arcsec=4.0,
-    time_ms=5.0,
-    iqr_ms=0.2,
-    noise_ms=0.01,
-    cpu_ms=5.0,
-    frames=20,
-)
-AUTO = replace(ROW, chosen="auto")
-
-
-def row(**changes: object) -> CombinationRow:
-    return replace(ROW, **changes)
-
-
-def test_rows_are_the_fastest_first_with_three_fronts():
-    rows = run.rows_of(
-        [
-            AUTO,
-            row(quantisation="round", time_ms=2.0, error_arcsec=3.0, error_mag=0.009),
-            row(quantisation="dither", time_ms=6.0, error_arcsec=1.5),
-            row(bit_stealing="true", time_ms=4.0, error_arcsec=0.9, error_mag=0.02),
-        ]
-    )
-    assert [each.time_ms for each in rows] == [2.0, 4.0, 5.0, 6.0]
-    assert [each.on_front for each in rows] == ["true", "true", "false", "false"]
-    # by light the first is the best of all
-    assert [each.on_front_mag for each in rows] == ["true", "false", "false", "false"]
-    # bit stealing is not effort's choice: without it auto is on its front
-    assert [each.on_front_as_filed for each in rows] == ["true", "false", "true", "false"]
-    bare = run.without_fronts(rows[0])
-    assert (bare.on_front, bare.on_front_mag, bare.on_front_as_filed) == ("", "", "")
-
-
-@pytest.mark.parametrize(
-    ("rival", "words"),
-    [
-        ({"time_ms": 9.0, "error_arcsec": 0.5}, "on the front"),
-        (
-            {"time_ms": 4.98, "noise_ms": 0.0},
-            "on the front within the noise: exact, cut sprites is 1 arcsec off and 0.02 ms faster"
-            " (noise 0.01 ms)",
-        ),
-        (
-            {"time_ms": 3.0, "quantisation": "round"},
-            "not on the front: round, cut sprites is 1 arcsec off and 2 ms faster (noise 0.014 ms):"
-            " effort compares exact and round by their worst star at any sub-pixel phase, not by a"
-            " field's rms",
-        ),
-        (
-            {"time_ms": 3.0, "bit_stealing": "true"},
-            "not on the front: exact with bit stealing, cut sprites is 1 arcsec off and 2 ms faster"
-            " (noise 0.014 ms): bit stealing is the bench file's choice, for a panel whose"
-            " primaries are known as the tracker sees them; on the front of what effort may choose",
-        ),
-    ],
-)
-def test_where_auto_stands_is_said_with_what_beats_it(rival, words):
-    assert run.standing([AUTO, row(**rival)]) == words
-
-
-def test_why_auto_does_not_take_a_row_is_each_choice_that_differs():
-    own = replace(AUTO, rate_deg_s=1.0)
-    assert run.words(own) == "exact, cut sprites, paths, rate"
-    for changes, words in (
-        ({"quantisation": "temporal"}, "temporal is right over an exposure"),
-        ({"sprite": "coarse"}, "coarse sprites are beyond the tolerance"),
-        ({"sprite": "full"}, "cut sprites save nothing here"),
-        ({"smear": "point"}, "points instead of paths"),
-        ({"prediction": "two samples"}, "prediction by two samples is the sender's choice"),
-        ({"faintest_v_mag": 6.5}, "the catalogue's depth is the bench file's choice"),
-    ):
-        reason = run.why_not(own, replace(own, **changes))
-        assert reason.startswith(words) and ";" not in reason
-    held = replace(own, prediction="held")
-    assert (
-        run.why_not(held, own) == "[attitude] max_extrapolation_ms = 0 is the bench file's choice"
-    )
-    both = run.why_not(own, replace(own, smear="point", sprite="coarse"))
-    assert both == "coarse sprites are beyond the tolerance; points instead of paths"
-
-
-BUDGET = [
-    ErrorPart("average field", "auto", "refresh", 0.2, 0.03),
-    ErrorPart("average field", "auto", "codes", 0.7, 0.01),
-    ErrorPart("average field", "auto", "rss", 0.73, 0.032),
-    ErrorPart("average field", "auto", "whole", 0.75, 0.033),
-    ErrorPart("1 deg/s", "auto", "refresh", math.nan, 0.03),
-    ErrorPart("1 deg/s", "auto", "codes", 0.7, 0.01),
-    ErrorPart("1 deg/s", "auto", "whole", 9.0, 0.01),
-]
-STAGES = [
-    StageTime("average field", "auto", "prediction", 1.0),
-    StageTime("average field", "auto", "drawing and codes", 3.0),
-]
-
-
-def test_a_scene_s_line_has_its_figures_and_the_largest_part_of_each():
-    line = run.scene_line([replace(AUTO, lost=2)], BUDGET[:4], STAGES, Load())
-    assert line == (
-        "average field: auto (exact, cut sprites) is 1 arcsec and 0.01 mag off over 30 stars, 2 of"
-        " them lost, in 5 ms; on the front; error: codes 0.7 arcsec; time: drawing and codes 75%"
-    )
-    finding = run.budget_finding(["average field", "1 deg/s"], BUDGET, STAGES, Load())
-    # what is not known counts as the largest
-    assert finding == (
-        "Of auto's error most is quantisation in the average field, panel's refresh at 1 deg/s; of"
-        " its time most is drawing and codes"
-    )
-
-
-def test_tables_and_charts_of_scenes_are_of_their_rows(tmp_path, figures):
-    scene = run.rows_of(
-        [
-            AUTO,
-            row(quantisation="round", time_ms=2.0, error_arcsec=3.0, chosen="default"),
-            row(quantisation="exact", faintest_v_mag=6.5, time_ms=4.0, error_arcsec=9.0, lost=3),
-        ]
-    )
-    result = run.SceneResult(scene, BUDGET[:4], STAGES)
-    lines = run.write_chain(tmp_path, [result], [], ["of nothing"], Load())
-    chain, budget = figures
-    (axes,) = chain.axes
-    assert axes.get_title(loc="left") == "Average field, 30 stars"
-    points = {tuple(line.get_xydata()[0]) for line in axes.get_lines() if line.get_marker() == "o"}
-    assert points == {(2.0, 3.0), (4.0, 9.0), (5.0, 1.0)}
-    rings = {}
-    for line in axes.get_lines():
-        if line.get_marker() == "o" and line.get_markerfacecolor() == "none":
-            rings[line.get_markeredgecolor()] = tuple(line.get_xydata()[0])
-    assert rings == {charts.RED: (5.0, 1.0), charts.INK: (2.0, 3.0)}
-    place, light, times = budget.axes
-    bars = [[bar.get_width() for bar in of.patches] for of in (place, light, times)]
-    assert bars == [[0.2, 0.7, 0.75], [0.03, 0.01, 0.033], [1.0, 3.0]]
-    colours = [bar.get_facecolor() for bar in place.patches]
-    assert colours[0] == colours[1] != colours[2]  # the whole of it
-    assert lines[0].startswith('at rest on 8 bits: set quantisation = "exact", 1 arcsec')
-    assert lines[1].startswith("bit stealing: not on this panel")
-    assert lines[-1] == (
-        "depth: keep faintest_v_mag = 7.5; with 6.5 the tracker loses 3 of 30 stars"
-    )
-
-
-def test_a_shallower_catalogue_is_judged_by_its_best_row():
-    rows = [ROW, row(faintest_v_mag=6.5, error_arcsec=2.0, lost=4)]
-    rows.append(row(faintest_v_mag=6.5, error_arcsec=1.5))
-    assert answers.depth_line(rows) == (
-        "depth: faintest_v_mag = 6.5 is enough; it loses none of 30 stars"
-    )
-    assert answers.depth_line([ROW]) == "depth: faintest_v_mag = 7.5 was measured alone"
-
-
-def test_bit_stealing_is_worth_what_it_takes_off_the_error():
-    plain = row(quantisation="round", error_arcsec=1.0, time_ms=4.0)
-    stealing = row(bit_stealing="true", error_arcsec=0.5, time_ms=6.0)
-    worse = row(bit_stealing="true", error_arcsec=0.95, error_mag=0.001, time_ms=6.0)
-    assert answers.stealing_line([plain, stealing, worse], plain, Load()) == (
-        "bit stealing, if the primaries are known in the tracker's colours: takes"
-        f" {charts.two_digits(1.0)} arcsec to {charts.two_digits(0.5)} in 1.50 of the time, with"
-        " exact"
-    )
-    assert "brings nothing at rest" in answers.stealing_line([plain, worse], plain, Load())
-    busy = Load(1e3)
-    assert "of the time" not in answers.stealing_line([plain, stealing], plain, busy)
-    assert answers.rest_lines([plain, row(error_arcsec=0.2)], Load())[0].startswith(
-        'at rest on 8 bits: set quantisation = "exact", 0.2 arcsec (round: 1 in 0.80 of the time)'
-    )
-
-
-def test_answers_are_whole_choices_of_what_the_sender_gives():
-    """Neither coarse nor full sprites, nor points; rates are used where they come, and only there."""
-    turning = row(rate_deg_s=1.0)
-    rows = [
-        turning,
-        replace(turning, prediction="two samples"),
-        replace(turning, prediction="held"),
-    ]
-    rows += [replace(turning, sprite="coarse"), replace(turning, sprite="full")]
-    rows += [replace(turning, smear="point"), replace(turning, faintest_v_mag=6.5)]
-    rows.append(replace(turning, quantisation="temporal"))
-    by_given = {}
-    for rates in (True, False):
-        chosen = answers.allowed(rows, answers.Given(primaries=True, rates=rates))
-        assert {(each.sprite, each.smear, each.quantisation) for each in chosen} == {
-            ("cut", "path", "exact")
-        }
-        by_given[rates] = [each.prediction for each in chosen]
-    assert by_given == {True: ["rate"], False: ["two samples", "held"]}
-
-
-def test_an_answer_s_light_is_held_against_rows_that_are_as_near():
-    """A row far off in place is no measure of light."""
-    near = row(quantisation="round", error_arcsec=1.0, error_mag=0.02)
-    far = row(error_arcsec=9.0, error_mag=0.001)
-    assert answers.simplest([near, far]) is near
-
-
-def test_a_prediction_s_error_is_that_of_its_best_codes():
-    rows = []
-    for prediction, quantisation, arcsec in (
-        *(("rate", "round", 3.0), ("rate", "exact", 2.0), ("rate", "temporal", 0.1)),
-        *(("two samples", "exact", 1.0), ("two samples", "round", 1.5), ("held", "exact", 70.0)),
-    ):
-        changes = {"prediction": prediction, "quantisation": quantisation}
-        rows.append(row(rate_deg_s=1.0, error_arcsec=arcsec, **changes))
-    rows.append(row(prediction="held", faintest_v_mag=6.5, error_arcsec=0.1))
-    rows.append(row(prediction="held", bit_stealing="true", error_arcsec=0.1))
-    assert answers.prediction_words(rows) == (
-        "send no rates, which carry such a vibration on (by the packets' rates 2, by two samples 1,"
-        " the newest attitude held 70 arcsec)"
-    )
-
-
-def test_the_title_says_in_how_many_scenes_auto_is_on_the_front():
-    beaten = row(scene="1 deg/s", time_ms=1.0, error_arcsec=0.1)
-    rows = [AUTO, replace(AUTO, scene="dense field"), replace(AUTO, scene="1 deg/s"), beaten]
-    title = run.headline(rows, Load())
-    assert title.endswith("or within its noise, in 2 of 3 scenes, not in 1 deg/s")
-    assert run.headline(rows[:3], Load()).endswith("in 3 of 3 scenes")
-    assert "2 of 3" not in run.headline(rows, Load(1e3))
-
-
-def test_points_are_named_on_the_front_where_they_are_a_tenth_better_and_once_a_code_beside_it():
-    rows = [
-        row(quantisation="round", error_arcsec=9.0, on_front="true"),
-        row(quantisation="round", error_arcsec=8.2, on_front="true", faintest_v_mag=6.5),
-        row(quantisation="exact", error_arcsec=8.0, on_front="true", bit_stealing="true"),
-        row(quantisation="dither", error_arcsec=30.0, rate_deg_s=1.0, smear="point"),
-        row(quantisation="dither", error_arcsec=20.0, rate_deg_s=1.0, prediction="held"),
-        replace(AUTO, error_arcsec=1.0, time_ms=12.0, on_front="true"),
-        row(quantisation="temporal", error_arcsec=40.0, chosen="default"),
-    ]
-    at = [(each.time_ms, each.error_arcsec) for each in rows]
-    assert [(name, place[1], colour) for name, place, colour in run.side_names(rows, at)] == [
-        ("round", 9.0, charts.PURPLE),
-        ("exact + bit stealing", 8.0, charts.BLUE),
-        ("auto: 1 arcsec, 12 ms", 1.0, charts.RED),
-        ("default: 40 arcsec, 5 ms", 40.0, charts.INK),
-        ("dither, paths held", 20.0, charts.ORANGE),
-        ("temporal", 40.0, charts.GREEN),
-    ]
-    assert run.short_words(rows[3], AUTO) == "dither, points by rate"
-    assert run.short_words(rows[1], AUTO) == "round, fewer stars"
-
-
-def test_an_error_of_nothing_stands_far_below_the_smallest(tmp_path, figures):
-    """On a logarithmic axis: a thousandth of it."""
-    rows = [AUTO, row(error_arcsec=0.0, time_ms=9.0)]
-    run.draw(tmp_path / "c", rows, "A finding", "a machine", [])
-    drawn = set()
-    for line in figures[0].axes[0].get_lines():
-        drawn.update(line.get_ydata())
-    assert min(drawn) == pytest.approx(1e-3) and max(drawn) == 1.0
-
-
-@dataclass(frozen=True)
-class SimpleGlass:
-    """A row of a glass."""
-
-    psf: str
-    error_arcsec: float
-
-
-def test_a_busy_machine_s_tables_have_no_front_and_no_verdict(tmp_path, monkeypatch):
-    for name in ("draw", "draw_budget"):
-        monkeypatch.setattr(run, name, lambda *drawn: None)
-    beaten = [AUTO, row(time_ms=1.0, error_arcsec=0.1)]
-    result = run.SceneResult(run.rows_of(beaten), BUDGET[:4], STAGES)
-    assert run.verdict([result], Load()) is False
-    assert run.verdict([result], Load(1e3)) is None
-    run.write_chain(tmp_path, [result], [], ["of nothing"], Load(1e3))
-    fronts = {
-        (row["on_front"], row["on_front_mag"], row["on_front_as_filed"])
-        for row in csv_rows(tmp_path / "chain.csv")
-    }
-    assert fronts == {("", "", "")}
-    glass = [SimpleGlass("a Gaussian", 2.0), SimpleGlass("a basis of 6", 0.5)]
-    run.write_chain(tmp_path, [result], glass, ["of nothing"], Load())
-    psfs = [(row["psf"], row["error_arcsec"]) for row in csv_rows(tmp_path / "chain_psf.csv")]
-    assert psfs == [("a Gaussian", "2.0"), ("a basis of 6", "0.5")]
-    assert {row["on_front"] for row in csv_rows(tmp_path / "chain.csv")} == {"true", "false"}
-
-
-def test_steps_that_change_nothing_are_named_and_not_drawn(tmp_path, figures):
-    """One that changes light alone is drawn."""
-    scene = "average field"
-    budget = [
-        ErrorPart(scene, "auto", "depth", 0.0, 0.03),
-        ErrorPart(scene, "auto", "smear", 0.0, 0.0),
-        ErrorPart(scene, "auto", "codes", 0.7, 0.01),
-        ErrorPart(scene, "auto", "prediction", 0.0, 0.0),
-        ErrorPart(scene, "auto", "whole", 0.75, 0.033),
-    ]
-    turning = replace(AUTO, scene="1 deg/s", rate_deg_s=1.0)
-    more = [replace(part, scene="1 deg/s", error_arcsec=2 * part.error_arcsec) for part in budget]
-    stages = [*STAGES, StageTime("1 deg/s", "auto", "sprites", 7.0)]
-    run.draw_budget(tmp_path / "b", [AUTO, turning], [*budget, *more], stages, Load())
-    place, light, times, turning_place, _, turning_times = figures[0].axes
-    # each scene's own parts and stages
-    assert [bar.get_width() for bar in turning_place.patches] == [0.0, 1.4, 1.5]
-    assert [bar.get_width() for bar in times.patches] == [1.0, 3.0]
-    assert [bar.get_width() for bar in turning_times.patches] == [7.0]
-    assert [bar.get_width() for bar in place.patches] == [0.0, 0.7, 0.75]
-    assert [bar.get_width() for bar in light.patches] == [0.03, 0.01, 0.033]
-    note = " ".join(figures[0].get_supxlabel().split())
-    assert note.endswith("; smear and prediction change nothing here.")

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.instruments.calibrate.geometric.dots import DotPlan
 from hilstar.instruments.study import geometry
 from hilstar.instruments.study.geometry import (
-    SIZES,
-    USUAL_NOISE_PX,
-    USUAL_SIZE,
     DotFaults,
-    Frames,
     TracedBench,
-    frames_of,
     observed_dots,
     turned,
 )
@@ -77,16 +72,16 @@ def test_directions_are_those_whose_rays_meet_the_pixels():
     np.testing.assert_allclose(found_y, y, atol=1e-6)
 
 
-def plan_of(count: int, frames: int) -> SimpleNamespace:
+def plan_of(x_px, y_px, frames: int) -> DotPlan:
     """Dots that are lit in every other frame, in turn."""
-    lit = (np.arange(count)[:, None] + np.arange(frames)) % 2 == 0
-    return SimpleNamespace(frames=frames, lit=lit)
+    lit = (np.arange(len(x_px))[:, None] + np.arange(frames)) % 2 == 0
+    return DotPlan(x_px, y_px, lit)
 
 
 def test_planted_dots_are_seen_in_their_frames_with_their_noise(rng):
     x, y = rng.uniform(1, 398, 900), rng.uniform(1, 298, 900)
     x[0], y[1] = 400.0, -1.0  # beyond the edge
-    plan = plan_of(900, 4)
+    plan = plan_of(x, y, 4)
     exact = observed_dots(plan, x, y, SIZE_PX, DotFaults(0.0, 0.0, 0.0), rng)
     for frame in range(4):
         of_frame = exact.frame == frame
@@ -110,35 +105,16 @@ def test_planted_dots_are_seen_in_their_frames_with_their_noise(rng):
     assert 300 < fewer.x_px[false].max() < 400 and fewer.y_px[false].max() < 300
 
 
-def test_frames_vary_in_number_or_in_noise():
-    found = frames_of(quick=False)
-    assert found == sorted(set(found))
-    assert {(each.count, each.dots) for each in found if each.noise_px == USUAL_NOISE_PX} == set(
-        SIZES
-    )
-    others = [each for each in found if each.noise_px != USUAL_NOISE_PX]
-    assert {(each.count, each.dots) for each in others} == {USUAL_SIZE}
-    assert Frames(*USUAL_SIZE, USUAL_NOISE_PX) in frames_of(quick=True)
-    assert len(frames_of(quick=True)) < len(found)
-
-
-def test_a_star_s_error_is_how_far_it_is_shown_from_its_traced_place(monkeypatch):
-    """A camera whose principal point is 3 px to the right and 4 px down of the traced one's."""
+def test_a_star_s_error_is_how_far_it_is_shown_from_its_traced_place():
+    """A camera whose principal point is 3 px to the right and 4 px down of the true one's."""
     true = Camera(SIZE_PX, 1000.0, (199.5, 149.5), np.eye(3))
     off = replace(true, principal_point_px=(202.5, 153.5))
-    places = []
-
-    def directions(x_px, y_px):
-        places.extend((x_px, y_px))
-        return true.rays(x_px, y_px)
-
-    traced = SimpleNamespace(resolution_px=SIZE_PX, directions=directions)
-    monkeypatch.setattr(geometry, "BENCH", traced)
-    errors_arcsec = geometry._star_errors(SimpleNamespace(monitor=off))
+    x_px, y_px = geometry.star_places_px(SIZE_PX)
+    errors_arcsec = geometry.off_arcsec(off, x_px, y_px, true.rays(x_px, y_px))
     assert len(errors_arcsec) == geometry.STARS
     np.testing.assert_allclose(errors_arcsec, 5 * ARCSEC_PER_RAD / 1000, rtol=1e-9)
     # all over the screen, from edge to edge of its outermost pixels
-    for place_px, side_px in zip(places, SIZE_PX, strict=True):
+    for place_px, side_px in zip((x_px, y_px), SIZE_PX, strict=True):
         ends = place_px.min(), place_px.max()
         assert ends == pytest.approx((-0.5, side_px - 0.5), abs=side_px / 400)
 

@@ -32,8 +32,8 @@ def test_processes_that_are_not_this_one_s_are_counted_while_they_run():
 
 def test_what_this_process_does_itself_is_not_other_work():
     work, before = OtherWork(), os.times()
-    while os.times().user - before.user < 0.5:
-        pass
+    while os.times().user - before.user < 0.3:
+        sum(range(100_000))  # to ask for the time is the system's work
     spent_s, passed_s = os.times().user - before.user, os.times().elapsed - before.elapsed
     # All of the machine less what this process had is the most that there can be of others.
     assert work.cores() <= CORES - spent_s / passed_s + 0.1

@@ -5,17 +5,14 @@ tables, words and places by closed forms, without a study.
 from __future__ import annotations
 
 import math
-from contextlib import contextmanager
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from astropy.io import fits
 
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
+from hilstar.instruments.simulate.simulator import Exposure
 from hilstar.instruments.study import economy, outputs, rapp
 from hilstar.instruments.study.economy import EffortComparison, EffortOutcome
-from hilstar.instruments.study.engine import row_panels
 from hilstar.instruments.study.fields import FIELDS, fields_of
 from hilstar.instruments.study.outputs import (
     OutputScene,
@@ -23,7 +20,6 @@ from hilstar.instruments.study.outputs import (
     _scene_words,
     _zoom,
     heat_words,
-    output_files,
     thesis_total_e,
 )
 from hilstar.instruments.study.sweep import NOT_JUDGED, Load
@@ -54,40 +50,6 @@ def bench(tmp_path_factory):
     path = tmp_path_factory.mktemp("bench") / "bench.toml"
     path.write_text(bench_text(BENCH))
     return read_bench_file(path)
-
-
-def test_a_bench_s_outputs_are_its_exposures_and_their_stars(bench, small_run):
-    run = small_run(outputs.run, bench, OWN)
-    lines, folder = run.told, run.folder
-    assert [line.split(":")[0] for line in lines] == ["orion", "lyra", "zeta_cas", "field"]
-    names = output_files(fields_of(OWN))
-    assert {name for name in names if name.endswith((".csv", ".fits"))} == {
-        path.name for path in folder.iterdir()
-    }
-    for field, line in zip(fields_of(OWN), lines, strict=True):
-        rows = csv_rows(folder / f"{field.stem}.csv")
-        with fits.open(folder / f"{field.stem}.fits") as opened:
-            noisy = opened[0].data.astype(float)
-        with fits.open(folder / f"{field.stem}_without_noise.fits") as opened:
-            clean = opened[0].data.astype(float)
-        assert noisy.shape == clean.shape == SIZE_PX[::-1]
-        difference = noisy - clean
-        assert difference.std() > 1.0
-        assert np.median(noisy) == pytest.approx(np.median(clean), abs=1.0)
-        x = np.array([float(row["x_px"]) for row in rows])
-        y = np.array([float(row["y_px"]) for row in rows])
-        inside = (x >= -0.5) & (x < 119.5) & (y >= -0.5) & (y < 89.5)
-        v_mag = np.array([float(row["v_mag"]) for row in rows])
-        light = [float(row["electrons_per_s"]) for row in rows]
-        assert light == sorted(light, reverse=True)
-        words = f"{inside.sum()} stars"
-        assert words in line
-        assert f"V {v_mag.min():.2f} to {v_mag.max():.2f}, mean {v_mag.mean():.2f}" in line
-        assert f"sky {np.median(noisy):.0f} DN" in line
-        brightest = int(np.argmax(np.where(inside, light, 0)))
-        column, row = round(x[brightest]), round(y[brightest])
-        near = clean[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]
-        assert near.max() == clean.max()
 
 
 def test_rapp_of_a_bench_s_stars_is_of_those_on_its_image(bench, small_run):
@@ -159,7 +121,7 @@ TRUTH = truth_of(
 
 
 def scene_outputs(truth=TRUTH, inside=(True, True, False)) -> outputs.Outputs:
-    noisy = SimpleNamespace(dn=np.full((90, 120), 33.4), truth=truth)
+    noisy = Exposure(None, np.full((90, 120), 33), np.full((90, 120), 33.4), truth)
     return outputs.Outputs(noisy, noisy, np.array(inside), 40.0, 12.3, 5.0, "a camera")
 
 
@@ -177,6 +139,7 @@ def test_a_zoom_is_about_its_star_the_brightest_on_the_image_or_the_middle():
     scene = OutputScene("s", "s", FIELDS[0], zoom_hip=12)
     name, place = _zoom(scene, scene_outputs())
     assert ("12" in name, tuple(place)) == (True, (10.0, 5.0))
+    assert _zoom(scene, scene_outputs(inside=(True, False, True)))[0] == "the middle"
     brightest = OutputScene("s", "s", FIELDS[0])
     assert tuple(_zoom(brightest, scene_outputs())[1]) == (0.0, 0.0)
     beyond = _zoom(brightest, scene_outputs(inside=(False, False, True)))
@@ -240,25 +203,15 @@ def test_effort_is_within_where_light_and_each_centroider_are():
     assert not outcome(flux_max_mag=0.051).within
 
 
-def test_each_panel_of_effort_s_chart_ends_over_its_own_highest_bar(tmp_path, monkeypatch):
+def test_each_panel_of_effort_s_chart_ends_over_its_own_highest_bar(tmp_path, figures):
     """A speed-up of 9 beside errors of 2.4 limits, and errors within them: the line at 1 is seen."""
-    drawn = []
-
-    @contextmanager
-    def kept(*parts):
-        with row_panels(*parts) as panels:
-            yield panels
-            drawn.append([axes.get_ylim() for axes in panels])
-
-    monkeypatch.setattr(economy, "row_panels", kept)
     full = outcome(tolerance="full", frame_ms=36.0)
     for worst_px in (0.24, 0.03):
         errors = {"flux_max_mag": 0.001, "max_px_fit": worst_px, "max_px_box5": 0.03}
         economy.draw(tmp_path / "a.png", [EffortComparison(full, outcome(**errors))], Load())
     room = 1.45  # for the legend
-    assert [limits for chart in drawn for limits in chart] == [
-        pytest.approx((0, room * height)) for height in (9.0, 2.4, 9.0, 1.0)
-    ]
+    limits = [axes.get_ylim() for figure in figures for axes in figure.axes]
+    assert limits == [pytest.approx((0, room * height)) for height in (9.0, 2.4, 9.0, 1.0)]
 
 
 def test_effort_s_gain_is_told_by_depth_over_the_default_tolerance_alone():
@@ -280,6 +233,7 @@ def test_effort_s_gain_is_told_by_depth_over_the_default_tolerance_alone():
         " as fast; largest errors of 40 stars 0.0200 mag and 0.0600 px by the worst of six"
         " centroiders (0.0400 by a PSF fit), within the tolerance"
     )
+    assert economy.economy_finding(pairs[:2]).endswith("within tolerance")
     slow = economy.line_of(pairs[3], Load())
     assert "2.0 times as SLOW" in slow and slow.endswith("OVER the tolerance")
     assert NOT_JUDGED in economy.line_of(pairs[0], Load(1e3))

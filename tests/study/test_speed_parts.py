@@ -28,6 +28,7 @@ from hilstar.instruments.study.speed.report import (
     TimeSpread,
 )
 from hilstar.instruments.study.sweep import Spent
+from hilstar.tracker.settings import DetectorSettings
 
 FULL_HD = (1920, 1080)
 SMALL = (640, 480)
@@ -179,22 +180,13 @@ def test_aims_are_met_by_what_they_name_and_judged_on_an_idle_machine():
     assert {aim.reached for aim in benchmark._aims(result)} == {None}
 
 
-def bare_cell(result: Result) -> benchmark.CellMeasurement:
-    """A measurement of no bench."""
-    measurement = object.__new__(benchmark.CellMeasurement)
-    measurement.result = result
-    measurement.cell_key = (*SMALL, 50)
-    measurement.stage_ms = {"cull": [90.0, 1.0, 3.0, 2.0], "splat": [7.0]}
-    return measurement
-
-
 def test_a_cell_s_rows_are_hilstar_s_own_its_stages_and_the_others():
     """A stage's first turn, which fills caches, counts only where it is the only one."""
-    result = Result(MACHINE)
     times_ms = {name: [5.0, 4.0, 9.0] for name in ("whole_frame", "turning", "linear_only")}
     times_ms |= {"stages": [1e9], "python": [0.5, 0.7, 0.1], "numpy": [60.0]}
-    bare_cell(result)._keep(times_ms)
-    rows = [(row.method, row.kind, row.ms) for row in result.rows]
+    stages_ms = {"cull": [90.0, 1.0, 3.0, 2.0], "splat": [7.0]}
+    found, python = benchmark.cell_times((*SMALL, 50), times_ms, stages_ms)
+    rows = [(row.method, row.kind, row.ms) for row in found]
     assert rows == [
         *(("hilstar", kind, TimeSpread(5.0, 4.0, 9.0)) for kind in ("whole_frame", "turning")),
         ("hilstar", "linear_only", TimeSpread(5.0, 4.0, 9.0)),
@@ -202,86 +194,73 @@ def test_a_cell_s_rows_are_hilstar_s_own_its_stages_and_the_others():
         ("hilstar", "splat", TimeSpread(7.0, 7.0, 7.0)),
         ("numpy", "linear_only", TimeSpread(60.0, 60.0, 60.0)),
     ]
-    assert {(row.size, row.stars) for row in result.rows} == {(SMALL, 50)}
-    assert result.python_ms == [PythonTime(*SMALL, 50, TimeSpread(0.5, 0.1, 0.7))]
+    assert {(row.size, row.stars) for row in found} == {(SMALL, 50)}
+    assert python == PythonTime(*SMALL, 50, TimeSpread(0.5, 0.1, 0.7))
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock of the benchmark's that a test sets, s."""
+    now_s = [0.0]
+    monkeypatch.setattr(benchmark.time, "perf_counter", lambda: now_s[0])
+    return now_s
 
 
 @pytest.mark.parametrize(("budget_s", "is_run"), [(1.6, True), (1.5, False)])
-def test_a_method_is_skipped_whose_frame_would_take_longer_than_its_budget(
-    monkeypatch, budget_s, is_run
-):
+def test_a_method_is_skipped_whose_frame_would_take_longer_than_its_budget(clock, budget_s, is_run):
     """50 ms for one star and 5 ms more for each further one: 302 stars take 1.56 s."""
-    sprites = benchmark.pack_sprites(*np.full((3, 302), 20.0), np.arange(302), (40, 40), 4)
-    measurement = bare_cell(Result(MACHINE))
-    measurement.sprites, measurement.sigma_px, measurement.shape = sprites, (1.0, 1.0), (40, 40)
 
-    def draw(part, sigma_px, shape):
-        return 0.05 + 0.005 * (len(part) - 1)
+    def sprites(count):
+        return benchmark.pack_sprites(*np.full((3, count), 20.0), np.arange(count), (40, 40), 4)
 
-    monkeypatch.setattr(benchmark, "_seconds", lambda work: work())
-    why = measurement._too_long(draw, budget_s)
+    def draw(part):
+        clock[0] += 0.05 + 0.005 * (len(part) - 1)
+
+    why = benchmark.too_long(draw, sprites(302), budget_s)
     assert (why is None) is is_run
     assert is_run or why == "n/a: about 2 s a frame, over the budget of 1.5 s"
-    measurement.sprites = benchmark.pack_sprites(
-        *np.full((3, 101), 20.0), np.arange(101), (40, 40), 4
-    )
-    assert measurement._too_long(draw, 0.0) is None
+    assert benchmark.too_long(draw, sprites(101), 0.0) is None
 
 
-def test_the_tracker_s_works_are_by_kind_hilstar_s_first_in_processor_time(monkeypatch):
-    """And the variables of threads that a worker sets are unset again."""
-    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "7")
+def test_the_tracker_s_times_are_by_kind_hilstar_s_first_in_processor_time():
+    spent = [Spent(99.0, 3.0), Spent(99.0, 1.0), Spent(99.0, 8.0)]
+    keys = [("sep", "find_stars"), ("numpy", "exposure"), ("hilstar", "verify")]
+    keys += [("hilstar", "find_stars"), ("hilstar", "exposure"), ("galsim", "exposure")]
+    rows = tracker.tracker_timings(dict.fromkeys(keys, spent), report.Cell(1024, 512, 12))
+    assert [(row.kind, row.method) for row in rows] == [
+        *(("exposure", name) for name in ("hilstar", "galsim", "numpy")),
+        *(("find_stars", name) for name in ("hilstar", "sep")),
+        ("verify", "hilstar"),
+    ]
+    assert {row.ms for row in rows} == {TimeSpread(3.0, 1.0, 8.0)}
+    assert {(row.size, row.stars) for row in rows} == {((1024, 512), 12)}
 
+
+def test_a_peer_that_is_not_installed_is_skipped_by_name():
     def absent():
         raise ImportError("no module")
 
-    class Exposing:
-        def __init__(self, file, folder):
-            self.simulator = SimpleNamespace(close=lambda: None)
-            self.exposure = SimpleNamespace(truth=[0] * 12)
-            self.case = 0
+    peers = {("sep", "find_stars"): absent, ("galsim", "exposure"): lambda: list}
+    works, (skipped,) = tracker.peer_works(peers)
+    assert works == {("galsim", "exposure"): list}
+    assert skipped.method == "sep"
+    assert skipped.why == "find_stars: not installed (no module): pip install 'hilstar[benchmark]'"
 
-        def session(self):
-            os.environ["OMP_NUM_THREADS"] = "1"
-            parameters = SimpleNamespace(parameters=[1], attitude_dimensions=3)
-            return SimpleNamespace(maker=parameters, close=lambda: None)
 
-        expose = numpy_noise = None
-        sep_stars = staticmethod(absent)
-
-        def galsim_noise(self):
-            return None
-
-        def photutils_stars(self):
-            return None
-
-    def timed(works, rounds, share_s):
-        return {name: [Spent(99.0, 3.0), Spent(99.0, 1.0), Spent(99.0, 8.0)] for name in works}
-
-    monkeypatch.setattr(tracker, "Exposing", Exposing)
-    monkeypatch.setattr(tracker, "in_turn", timed)
-    rows, skipped = tracker.tracker_rows(3, 1.0)
-    assert [(row.kind, row.method) for row in rows] == [
-        *(("exposure", name) for name in ("hilstar", "galsim", "numpy")),
-        *(("find_stars", name) for name in ("hilstar", "photutils")),
-        *(("case", "hilstar"), ("verify", "hilstar")),
-    ]
-    assert {row.ms for row in rows} == {TimeSpread(3.0, 1.0, 8.0)}
-    assert {(row.size, row.stars) for row in rows} == {((1024, 1024), 12)}
-    (absent_one,) = skipped
-    assert (absent_one.method, "hilstar[benchmark]" in absent_one.why) == ("sep", True)
+def test_variables_of_threads_that_a_worker_sets_are_unset_again(monkeypatch):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "7")
+    with tracker.threads_unset():
+        os.environ["OMP_NUM_THREADS"] = "1"
     assert "OMP_NUM_THREADS" not in os.environ
     assert os.environ["OPENBLAS_NUM_THREADS"] == "7"
 
 
 def test_noise_by_numpy_is_of_the_detector_s_own_figures():
     """Poisson noise and read noise, in whole DN from 0 to full scale."""
-    made = object.__new__(tracker.Exposing)
-    made.rng = np.random.default_rng(3)
-    made.detector = SimpleNamespace(read_noise_e=20.0, gain_e_per_dn=4.0, bits=8)
-    made.exposure = SimpleNamespace(mean_e=np.array([[400.0] * 20_000, [2000.0] * 20_000]))
-    dn = made.numpy_noise()
+    detector = DetectorSettings(read_noise_e=20.0, gain_e_per_dn=4.0, bits=8)
+    mean_e = np.array([[400.0] * 20_000, [2000.0] * 20_000])
+    dn = tracker.numpy_dn(mean_e, detector, np.random.default_rng(3))
     assert dn.dtype == np.uint16 and dn[1].max() == dn[1].min() == 255
     assert dn[0].mean() == pytest.approx(100.0, rel=0.01)
     # and a twelfth by rounding
@@ -323,37 +302,24 @@ def test_a_scene_keeps_the_brightest_in_view_and_fills_up_with_faint_ones(bench_
     assert shares.mean() == pytest.approx(0.5, abs=4 / np.sqrt(12 * len(shares)))
 
 
-def test_a_stage_is_culling_then_projecting_then_drawing(monkeypatch):
-    """In 1, 2 and 4 ms, of which the drawing's are its own stages'."""
-    now_ms = [0.0]
-    monkeypatch.setattr(benchmark.time, "perf_counter", lambda: now_ms[0] * 1e-3)
+def test_a_stage_is_culling_then_projecting_then_drawing(bench_with, clock, monkeypatch):
+    """By a clock that stands still but for culling, which takes 1 ms."""
+    bench = bench_with()
+    q = benchmark.from_radec_roll_deg(*benchmark.RADEC_ROLL_DEG)
+    cell = report.Cell(*bench.camera.resolution_px, 9)
+    with benchmark.CellMeasurement(bench, q, cell, Result(MACHINE)) as measurement:
+        near = measurement.candidates.near
 
-    def takes(ms, result=None):
-        now_ms[0] += ms
-        return result
+        def near_in_a_ms(*asked):
+            clock[0] += 1e-3
+            return near(*asked)
 
-    measurement = bare_cell(Result(MACHINE))
-    measurement.stage_ms = {}
-    measurement.icrs_to_image = np.eye(3)
-    near = (np.arange(2), np.zeros((3, 2)), np.ones(2))
-    measurement.candidates = SimpleNamespace(near=lambda *asked: takes(1, near))
-    camera = SimpleNamespace(project=lambda rays: takes(2, (np.zeros(2), np.zeros(2))))
-    camera.resolution_px = (40, 30)
-    measurement.bench = SimpleNamespace(shown_stars=None, camera=camera)
-    measurement.staged = SimpleNamespace(
-        footprint_px=8,
-        draw=lambda sprites: takes(4),
-        levels=lambda: takes(9),
-        stage_ms={"splat": 4.0, "read_back": 9.0},
-    )
-    for _ in range(2):
-        measurement._draw_stages()
-    assert measurement.stage_ms == {
-        "cull": pytest.approx([1.0, 1.0]),
-        "project": pytest.approx([2.0, 2.0]),
-        "splat": [4.0, 4.0],
-        "read_back": [9.0, 9.0],
-    }
+        monkeypatch.setattr(measurement.candidates, "near", near_in_a_ms)
+        for _ in range(2):
+            measurement._draw_stages()
+    assert measurement.stage_ms["cull"] == pytest.approx([1.0, 1.0])
+    assert measurement.stage_ms["project"] == [0.0, 0.0]
+    assert set(measurement.stage_ms) > {"cull", "project", "splat"}
 
 
 def test_a_fresh_process_s_figures_are_medians_of_the_reference_size():

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 import re
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from functools import partial
 
@@ -14,13 +14,11 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from hilstar.basics import charts
 from hilstar.basics.charts import two_digits
 from hilstar.display.response import table_response
 from hilstar.instruments.study.stability import CaseFigures, FailureCase, image, recorded
 from hilstar.instruments.study.stability import run as stability
 from hilstar.optics.sprites import pack_sprites
-from tests.support.tables import csv_rows
 
 CASES = 43
 
@@ -28,25 +26,29 @@ CASES = 43
 CURVES = ("narrow_stars", "weak_perspective", "popping", "turns")  # tables with a chart each
 
 
-@pytest.fixture(scope="module")
-def stability_study(whole_study):
-    """The command's folder and output, and its cases."""
-    cases = []
-
-    def keep(directory):
-        cases.extend(run(directory))
-        return cases
-
-    run = stability.run
+@contextmanager
+def few_cases(steps=image.STEPS):
+    """A study of two cases that are drawn, with all curves, one of them of so many steps: each case
+    has a test of its own.
+    """
+    image.moving_code_fluxes.cache_clear()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stability, "run", keep)
+        patch.setattr(image, "DRAWN", (image.no_stars, image.wide_star))
+        patch.setattr(image, "STEPS", steps)
+        yield
+    image.moving_code_fluxes.cache_clear()
+
+
+@pytest.fixture(scope="module")
+def small(small_run):
+    with few_cases(steps=31):
+        return small_run(stability.run)
+
+
+def test_a_whole_study_draws_its_curves(whole_study):
+    with few_cases():
         found = whole_study("stability", CURVES, "")
-    return found, cases
-
-
-@pytest.mark.parametrize("number", range(CASES))
-def test_each_case_of_the_command_is_right(stability_study, number):
-    assert_right_where_the_other_is_not(stability_study[1][number])
+    assert found.right is True and len(found.findings) == CASES - len(image.DRAWN) + 2
 
 
 def test_a_wide_star_s_light_is_said_by_how_much_it_is_off():
@@ -92,37 +94,6 @@ def assert_right_where_the_other_is_not(case):
     assert all((case.case, case.method, case.fails, case.happens, case.why))
     theirs = replace(case, figures=replace(case.figures, error=case.figures.fault))
     assert not theirs.right
-
-
-def test_the_table_has_every_case_and_the_curves_have_charts(stability_study):
-    found, measured = stability_study
-    assert found.right is True and len(found.findings) == len(measured) == CASES
-    rows = found.rows("stability")
-    assert [row["case"] for row in rows] == [case.case for case in measured]
-    assert {
-        case.case
-        for name in ("catalogue_and_geometry", "detector_and_attitude")
-        for case in recorded(name)
-    } < {row["case"] for row in rows}
-    for row in rows:
-        assert (
-            row["verdict"] == "right"
-            and row["failing method"]
-            and row["its failure"]
-            and row["why"]
-        )
-        assert float(row["error"]) <= float(row["tolerance"])
-        assert not float(row["its error"]) <= float(row["tolerance"])
-    peaks = {
-        float(row["sigma_px"]): float(row["sampled_peak_error"])
-        for row in found.rows("narrow_stars")
-    }
-    # a Gaussian's middle is over the mean of its pixel
-    assert all(peak > 0.02 for peak in peaks.values())
-    assert peaks[min(peaks, key=lambda sigma_px: abs(sigma_px - 0.85))] == pytest.approx(
-        0.12, abs=0.02
-    )
-    assert all(len(found.rows(name)) > 25 for name in CURVES)
 
 
 def test_what_is_no_number_is_not_right():
@@ -171,16 +142,6 @@ def test_the_polynomial_of_the_shader_is_the_shader_s():
     x = np.linspace(-5, 5, 20_001)
     # float32 rounds the inputs too: 2e-7 at 4, where erf is flat, and 6e-8 at 1.
     assert np.abs(image.erf_float32(x) - erf(x)).max() <= image.ERF_ERROR + 6e-8
-
-
-def test_the_chart_of_popping_shows_what_its_title_says(stability_study):
-    rows = stability_study[0].rows("popping")
-    assert len(rows) == image.STEPS
-    spread = {
-        name: np.ptp([float(row[f"{name} [mag]"]) for row in rows])
-        for name in ("linear image", "codes, exact", "codes, round")
-    }
-    assert spread["linear image"] <= image.RIPPLE < spread["codes, exact"] < spread["codes, round"]
 
 
 # The failing method's error by a closed form, and how near it comes to that.
@@ -294,22 +255,17 @@ def test_a_repeated_index_keeps_one_star_of_a_pixel():
     assert np.unravel_index(light.argmax(), light.shape) == (30, 46)
 
 
-def drawn_by(maker, folder, monkeypatch):
-    """The one chart of a function that writes into a folder, with its columns by name."""
-    saved = []
-    monkeypatch.setattr(charts, "save", lambda figure, path: saved.append((figure, path)))
-    maker(folder)
-    ((figure, path),) = saved
-    rows = csv_rows(folder / f"{path.name}.csv")
-    columns = [np.array([float(row[name]) for row in rows]) for name in rows[0]]
-    return figure, dict(zip(rows[0], columns, strict=True))
+def columns_of(run, name):
+    """A table's columns by name."""
+    rows = run.rows(name)
+    return {column: np.array([float(row[column]) for row in rows]) for column in rows[0]}
 
 
-def test_sampling_s_errors_by_sigma_are_those_of_a_gaussian(tmp_path, monkeypatch):
+def test_sampling_s_errors_by_sigma_are_those_of_a_gaussian(small):
     """Sampled at 21 places within a pixel: its sum by the Gaussian's harmonics, its middle against
     the integral by erf; hilstar's light and middle are right to float32.
     """
-    figure, table = drawn_by(stability.narrow_sigmas, tmp_path, monkeypatch)
+    figure, table = small.charts["narrow_stars"], columns_of(small, "narrow_stars")
     sigma = table["sigma_px"]
     assert (sigma[0], sigma[-1], len(sigma)) == pytest.approx((0.1, 2.0, 27))
     orders = np.arange(1, 12)[:, None]
@@ -347,8 +303,8 @@ def test_the_sigma_from_which_sampling_is_nearer_is_the_first_of_its_kind():
     assert text.endswith("at every sigma to 2 px")
 
 
-def test_one_depth_for_all_is_off_by_the_tangent_less_the_sine(tmp_path, monkeypatch):
-    figure, table = drawn_by(stability.weak_perspectives, tmp_path, monkeypatch)
+def test_one_depth_for_all_is_off_by_the_tangent_less_the_sine(small):
+    figure, table = small.charts["weak_perspective"], columns_of(small, "weak_perspective")
     angle = np.radians(table["field_angle_deg"])
     off_px = 350e3 / 57.65 * (np.tan(angle) - np.sin(angle))
     np.testing.assert_allclose(np.abs(table["error_px"]), off_px, rtol=1e-6)
@@ -357,7 +313,7 @@ def test_one_depth_for_all_is_off_by_the_tangent_less_the_sine(tmp_path, monkeyp
     share = (math.tan(five) - math.sin(five)) / (math.tan(ten) - math.sin(ten))
     # where sin(10 degrees) is the tangent
     ten_arcsec = (ten - math.atan(math.sin(ten))) * 206_264.8
-    title = " ".join(figure.get_suptitle().replace("\N{NO-BREAK SPACE}", " ").split())
+    title = small.title("weak_perspective")
     assert f"off by {ten_px:.0f} px or {ten_arcsec:.0f} arcsec ten degrees" in title
     assert f"by {share:.2f} of that at five" in title
     (upper,), (lower,) = (axes.get_lines() for axes in figure.axes)
@@ -365,23 +321,18 @@ def test_one_depth_for_all_is_off_by_the_tangent_less_the_sine(tmp_path, monkeyp
     np.testing.assert_array_equal(lower.get_ydata(), np.abs(table["error_arcsec"]))
 
 
-def test_a_turn_between_samples_is_drawn_by_its_way(tmp_path, monkeypatch):
-    figure, table = drawn_by(stability.turns, tmp_path, monkeypatch)
+def test_a_turn_between_samples_is_drawn_by_its_way(small):
+    figure, table = small.charts["turns"], columns_of(small, "turns")
     turn_deg, line, slerp, rated = table.values()
     assert (slerp[turn_deg < 180] < 1e-3).all() and (slerp[turn_deg > 185] > 1e5).all()
-    assert f"within {two_digits(rated.max())} arcsec" in figure.get_suptitle().replace("\n", " ")
+    assert f"within {two_digits(rated.max())} arcsec" in small.title("turns")
     drawn = [curve.get_ydata() for curve in figure.axes[0].get_lines()[:3]]
     for wanted, curve in zip((line, slerp, rated), drawn, strict=True):
         np.testing.assert_array_equal(curve, np.maximum(wanted, 1e-12))
 
 
-def test_the_chart_of_popping_has_each_way_s_light_in_magnitudes(tmp_path, monkeypatch):
-    monkeypatch.setattr(image, "STEPS", 31)
-    image.moving_code_fluxes.cache_clear()
-    try:
-        figure, table = drawn_by(stability.ripples, tmp_path, monkeypatch)
-    finally:
-        image.moving_code_fluxes.cache_clear()
+def test_the_chart_of_popping_has_each_way_s_light_in_magnitudes(small):
+    figure, table = small.charts["popping"], columns_of(small, "popping")
     np.testing.assert_allclose(table["x_px"], np.linspace(0, 3, 31))
     spread = {name: np.ptp(values) for name, values in table.items()}
     # two axes of a first harmonic of 2 exp(-2 pi^2 / 4), in magnitudes, at chance places
@@ -389,7 +340,7 @@ def test_the_chart_of_popping_has_each_way_s_light_in_magnitudes(tmp_path, monke
     assert 0.5 * largest < spread["point sampled, sigma 0.5 px [mag]"] < 1.01 * largest
     assert spread["linear image [mag]"] < image.RIPPLE < spread["codes, exact [mag]"]
     assert spread["codes, exact [mag]"] < 0.5 * spread["codes, round [mag]"]
-    title = figure.get_suptitle().replace("\n", " ").replace("\N{NO-BREAK SPACE}", " ")
+    title = small.title("popping")
     assert f"by {spread['codes, exact [mag]']:.3f} mag with exact" in title
     assert f"by {spread['codes, round [mag]']:.3f} mag with rounded" in title
     (millionths,) = figure.axes[1].get_lines()
@@ -398,19 +349,10 @@ def test_the_chart_of_popping_has_each_way_s_light_in_magnitudes(tmp_path, monke
     assert np.abs(table["codes, exact [mag]"]).max() < 0.1
 
 
-def test_a_study_has_the_recorded_cases_about_those_that_draw(tmp_path, monkeypatch):
+def test_a_study_has_the_recorded_cases_about_those_that_draw(small):
     """In the order of the chain, with a verdict each; then a chart of each kind of curve."""
-    drawn = (image.no_stars, image.wide_star)
-    monkeypatch.setattr(image, "DRAWN", drawn)
-    curves = []
-    for name in ("narrow_sigmas", "weak_perspectives", "ripples", "turns"):
-        monkeypatch.setattr(
-            stability, name, lambda folder, name=name: curves.append((folder, name))
-        )
-    cases = stability.run(tmp_path)
-    assert curves == [
-        (tmp_path, name) for name in ("narrow_sigmas", "weak_perspectives", "ripples", "turns")
-    ]
+    cases = small.told
+    assert list(small.charts) == list(CURVES)
     first, last = recorded("catalogue_and_geometry"), recorded("detector_and_attitude")
     known = [case.case for case in (*first, image.no_stars(), image.wide_star(), *last)]
     assert [case.case for case in cases] == known
@@ -418,7 +360,7 @@ def test_a_study_has_the_recorded_cases_about_those_that_draw(tmp_path, monkeypa
         "no star in view",
         "sigma 20 px",
     ]
-    rows = csv_rows(tmp_path / "stability.csv")
+    rows = small.rows("stability")
     assert [row["case"] for row in rows] == [case.case for case in cases]
     for row, case in zip(rows, cases, strict=True):
         assert row["verdict"] == "right" and row["failing method"] == case.method

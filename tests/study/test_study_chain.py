@@ -8,10 +8,11 @@ import json
 import math
 import os
 import re
-from dataclasses import fields, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -33,10 +34,12 @@ from hilstar.instruments.study.chain.choices import (
 )
 from hilstar.instruments.study.chain.glass import draw_glass, glass_rows
 from hilstar.instruments.study.chain.measuring import Rounds, SceneMeasurement, error_budget
-from hilstar.instruments.study.chain.run import NOT_JUDGED, CombinationRow, beating, front
+from hilstar.instruments.study.chain.run import NOT_JUDGED, front
 from hilstar.instruments.study.chain.tracker import MATCH_PX, StudyTracker, off
 from hilstar.optics.glass.psf_file import glass_of, write_glass
 from hilstar.server.bench.bench_file import bench_file_of
+from hilstar.server.bench.cameras import tracker_psf
+from hilstar.tracker.centroiders import star_places
 from tests.support.benches import ORION_Q
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.figures import assert_legible
@@ -96,9 +99,16 @@ def scene_of(parts, number: int) -> SceneMeasurement:
     return SceneMeasurement(benches, tracker, five_scenes(benches.own)[number], PLAN)
 
 
+WHOLE = ("dense field", "10 deg/s")  # of the command's scenes; the others are the small chain's
+
+
 @pytest.fixture(scope="module")
 def chain_study(tmp_path_factory, whole_study):
     """What the command prints of the small bench, and the folder of its files."""
+
+    def some(own):
+        return [scene for scene in five_scenes(own) if scene.name in WHOLE]
+
     folder = tmp_path_factory.mktemp("chain")
     (folder / "bench.toml").write_text(SMALL)
     # two frames of each combination: no claim here is of a time
@@ -106,6 +116,7 @@ def chain_study(tmp_path_factory, whole_study):
         patch.setattr(measuring, "MIN_ROUNDS", 2)
         patch.setattr(measuring, "FRAMES_A_VISIT", 1)
         patch.setattr(run, "QUICK", Rounds(exposures=1, time_s=0.0))
+        patch.setattr(run, "five_scenes", some)
         result = run_hilstar_here(
             "study", "chain", folder / "bench.toml", "-o", folder / "out", "--quick", "--json"
         )
@@ -119,7 +130,14 @@ def small_chain(small_run, tmp_path_factory):
     file = small_file(tmp_path_factory.mktemp("bench"))
 
     def two(own):
-        average, _, _, slow, _ = five_scenes(own)
+        scenes = five_scenes(own)
+        assert {scene.name for scene in scenes} == {
+            "average field",
+            "faint field",
+            "1 deg/s",
+            *WHOLE,
+        }
+        average, _, _, slow, _ = scenes
         return average, slow
 
     in_glass = []
@@ -155,7 +173,7 @@ def test_auto_and_default_are_each_one_point_of_each_scene(chain_study):
     told, out = chain_study
     rows = csv_rows(out / "chain.csv")
     names = list(dict.fromkeys(row["scene"] for row in rows))
-    assert names == ["average field", "dense field", "faint field", "1 deg/s", "10 deg/s"]
+    assert names == list(WHOLE)
     for name in names:
         for mark in ("auto", "default"):
             (row,) = [row for row in rows if row["scene"] == name and row["chosen"] == mark]
@@ -164,7 +182,7 @@ def test_auto_and_default_are_each_one_point_of_each_scene(chain_study):
         (line,) = (line for line in told["findings"] if line.startswith(f"{name}: auto"))
         assert "on the front" in line or NOT_JUDGED in line
     assert {row["quantisation"] for row in rows} == {"round", "dither", "temporal", "exact"}
-    assert {row["prediction"] for row in rows if row["scene"] == "1 deg/s"} == {
+    assert {row["prediction"] for row in rows if row["scene"] == "10 deg/s"} == {
         "rate",
         "two samples",
         "held",
@@ -174,21 +192,35 @@ def test_auto_and_default_are_each_one_point_of_each_scene(chain_study):
         assert_drawn(out / f"{name}.png")
 
 
-def test_the_psf_of_a_glass_is_an_axis_of_the_chain(tmp_path, monkeypatch):
-    """Each PSF that may stand for it, the more components the nearer, and the whole is right to
-    1e-3 px.
-    """
-    monkeypatch.setattr(chain_glass, "QUICK_TIME_S", 0.1)
-    write_glass(tmp_path / "psf.fits", glass_of(stack(3)))
+ORION = ChainScene("Orion", "", np.array(ORION_Q))
+WHOLE_PX = 1e-3  # of the whole glass, star by star
+
+
+@pytest.fixture(scope="module")
+def glass_file(tmp_path_factory):
+    """The small bench behind a glass, by its brighter stars."""
+    folder = tmp_path_factory.mktemp("glass")
+    write_glass(folder / "psf.fits", glass_of(stack(3)))
     tracker = "[tracker]\nfocal_length_mm = 12\nresolution_px = [256, 256]"
-    text = re.sub(r"focal_length_mm = 70\n|resolution_px = \[320, 320\]\n", "", SMALL).replace(
-        "[tracker]", tracker, 1
-    )
-    file = small_file(
-        tmp_path,
-        text.replace("[sky]", '[tracker.optics]\npsf = "psf.fits"\n[sky]').replace("= 9", "= 6"),
-    )
-    rows = glass_rows(file, ChainScene("Orion", "", np.array(ORION_Q)), quick=True)
+    text = re.sub(r"focal_length_mm = 70\n|resolution_px = \[320, 320\]\n", "", SMALL)
+    text = text.replace("[tracker]", tracker, 1).replace("= 9", "= 6")
+    text = text.replace("[sky]", '[tracker.optics]\npsf = "psf.fits"\n[sky]')
+    return small_file(folder, text)
+
+
+def test_a_glass_s_stars_are_held_against_its_whole_basis_where_they_stand(glass_file):
+    tracker = glass_file.config.tracker
+    whole = tracker_psf(msgspec.structs.replace(tracker, effort="full"), glass_file.folder)
+    with Simulator(glass_file, psf=whole) as simulator:
+        error = chain_glass.errors_in(simulator, whole, {"whole": whole}, ORION)["whole"]
+    assert error.stars > 10 and error.error_percent < 0.02
+    assert error.error_arcsec < WHOLE_PX * 13e-3 / 12 * ARCSEC_PER_RAD
+
+
+def test_the_psf_of_a_glass_is_an_axis_of_the_chain(glass_file, monkeypatch, tmp_path):
+    """Each PSF that may stand for it, the more components the nearer."""
+    monkeypatch.setattr(chain_glass, "QUICK_TIME_S", 0.1)
+    rows = glass_rows(glass_file, ORION, quick=True)
     names = [
         "a Gaussian",
         "one PSF for all stars",
@@ -208,7 +240,7 @@ def test_the_psf_of_a_glass_is_an_axis_of_the_chain(tmp_path, monkeypatch):
         > 0
     )
     assert (
-        whole.error_arcsec < 1e-3 * 13e-3 / 12 * ARCSEC_PER_RAD
+        whole.error_arcsec < WHOLE_PX * 13e-3 / 12 * ARCSEC_PER_RAD
         and whole.error_percent < 0.02 < gaussian.error_percent
     )
     assert (
@@ -221,7 +253,7 @@ def test_the_psf_of_a_glass_is_an_axis_of_the_chain(tmp_path, monkeypatch):
         draw_glass(place, light, rows)
     assert_legible(place.figure)
     bare = small_file(tmp_path)
-    assert glass_rows(bare, ChainScene("Orion", "", np.array(ORION_Q)), quick=True) == []
+    assert glass_rows(bare, ORION, quick=True) == []
 
 
 def test_the_budget_adds_up_to_the_whole_error_of_auto(small_chain):
@@ -309,7 +341,7 @@ def test_a_star_that_is_lost_is_no_nearer_than_one_that_is_found_late(parts):
     )
 
 
-def test_a_long_exposure_is_said_to_be_measured_in_part(chain_study, tmp_path):
+def test_a_long_exposure_is_said_to_be_measured_in_part(small_chain, tmp_path):
     with Parts(
         small_file(tmp_path, SMALL.replace("aperture_mm", "exposure_s = 3.5\naperture_mm"))
     ) as long:
@@ -317,128 +349,8 @@ def test_a_long_exposure_is_said_to_be_measured_in_part(chain_study, tmp_path):
         seen = choices.exposure(long.own, 20)
     assert said == "exposures of 16 refreshes, 0.267 s, in the place of [tracker] exposure_s = 3.5"
     assert seen.length_s == pytest.approx(16 / 60)
-    told, out = chain_study
-    assert not any("in the place of" in line for line in told["findings"])
-    assert {row["exposure_s"] for row in csv_rows(out / "chain.csv")} == {"0.1"}
-
-
-def combination_row(**figures) -> CombinationRow:
-    known = {field.name: 1.0 for field in fields(CombinationRow)}
-    words = {
-        "scene": "s",
-        "smear": "path",
-        "prediction": "rate",
-        "quantisation": "exact",
-        "sprite": "cut",
-        "chosen": "",
-        "rate_deg_s": 0.0,
-    }
-    return CombinationRow(
-        **(known | words | {"on_front": "true", "on_front_mag": "true", "noise_ms": 0.01} | figures)
-    )
-
-
-@pytest.mark.parametrize(
-    ("rival", "right"),
-    [
-        ({"time_ms": 5.0, "error_arcsec": 9.0}, True),  # faster, and less right
-        ({"time_ms": 4.97, "error_arcsec": 1.0}, True),  # within three sigmas of both medians
-        ({"time_ms": 4.9, "error_arcsec": 1.0}, False),
-        ({"time_ms": 1.0, "error_arcsec": 1.0, "bit_stealing": 2.0}, True),  # not effort's choice
-    ],
-)
-def test_auto_is_right_where_no_choice_of_its_own_is_better_beyond_the_noise(rival, right):
-    """Each median has a noise of 0.01 ms: three sigmas of their difference are 0.042 ms."""
-    auto = combination_row(chosen="auto", time_ms=5.0, error_arcsec=2.0)
-    alone = [auto, combination_row(time_ms=6.0, error_arcsec=3.0)]
-    assert run.is_right([alone])
-    assert run.is_right([alone, [auto, combination_row(**rival)]]) is right
-
-
-@pytest.mark.parametrize("place", [(0, 0), (-1, 0), (0, -1), (-1, -1)])
-def test_the_chart_names_its_front_and_what_is_chosen(monkeypatch, tmp_path, place):
-    """The slowest or fastest point, the worst or best of them, is the default, and the one
-    beside it auto.
-    """
-    time_ms, error = sorted((1.0, 9.0))[place[0]], sorted((0.1, 900.0))[place[1]]
-    rows = [
-        combination_row(time_ms=t, error_arcsec=e)
-        for t in (1.0, 3.0, 9.0)
-        for e in (0.1, 10.0, 900.0)
-    ]
-    rows += [
-        combination_row(time_ms=time_ms * k, error_arcsec=error, chosen=name)
-        for name, k in (("default", 1), ("auto", 1.01))
-    ]
-    kept = []
-    monkeypatch.setattr(charts, "save", lambda figure, path: kept.append(figure))
-    run.draw(tmp_path / "c", rows, "A finding", "a machine", [])
-    (figure,) = kept
-    assert_legible(figure)
-    names = [text.get_text() for text in figure.axes[0].texts]
-    for name, k in (("default", 1), ("auto", 1.01)):
-        assert (
-            f"{name}: {charts.two_digits(error)} arcsec, {charts.two_digits(time_ms * k)} ms"
-            in names
-        )
-    assert "exact" in names and "dither" not in " ".join(names)
-
-
-def test_a_busy_machine_has_no_front(monkeypatch, tmp_path):
-    rows = [
-        run.without_fronts(combination_row(time_ms=t, error_arcsec=10 / t, chosen=name))
-        for t, name in ((1.0, "auto"), (3.0, ""))
-    ]
-    assert {(row.on_front, row.on_front_mag, row.on_front_as_filed) for row in rows} == {
-        ("", "", "")
-    }
-    kept = []
-    monkeypatch.setattr(charts, "save", lambda figure, path: kept.append(figure))
-    run.draw(tmp_path / "c", rows, "A finding", "a machine", [])
-    (figure,) = kept
-    assert_legible(figure)
-    assert "front" not in figure.get_supxlabel()
-
-
-def test_scenes_that_are_alike_are_drawn_once():
-    rates = {
-        "average field": (0.0, 0.23),
-        "dense field": (0.0, 0.24),
-        "faint field": (0.0, 0.9),
-        "1 deg/s": (1.0, 0.25),
-    }
-    rows = [
-        combination_row(scene=name, rate_deg_s=rate, error_arcsec=error, chosen="auto")
-        for name, (rate, error) in rates.items()
-    ]
-    assert run.differing(rows) == {
-        "average field": ["dense field"],
-        "faint field": [],
-        "1 deg/s": [],
-    }
-
-
-def test_a_point_is_beaten_by_one_that_is_no_worse_and_no_slower():
-    spots = [(1.0, 3.0), (2.0, 2.0), (2.0, 2.0), (2.0, 2.5), (3.0, 1.0), (3.5, 1.0)]
-    assert front([combination_row(time_ms=t, error_mag=e) for t, e in spots], "error_mag") == [
-        True,
-        True,
-        True,
-        False,
-        True,
-        False,
-    ]
-
-    def beaters(which, *points):
-        rows = [combination_row(time_ms=t, error_arcsec=e, noise_ms=n) for t, e, n in points]
-        rows[which] = replace(rows[which], chosen="auto")
-        return tuple([rows.index(row) for row in found] for found in beating(rows))
-
-    near = (1.00, 1.0, 0.01), (1.02, 1.0, 0.01), (1.5, 1.0, 0.01)
-    assert beaters(1, *near) == ([], [0])
-    assert beaters(2, *near) == ([0, 1], [])
-    assert beaters(0, (1.02, 1.0, 0.01), (1.0, 0.1, 0.01)) == ([], [1])
-    assert beaters(0, (1.02, 1.0, 0.0), (1.02, 0.1, 0.0)) == ([1], [])
+    assert not any("in the place of" in line for line in small_chain.told.lines)
+    assert {row["exposure_s"] for row in small_chain.rows("chain")} == {"0.1"}
 
 
 def test_what_cannot_be_studied_is_refused_in_one_line(tmp_path):
@@ -506,82 +418,6 @@ def test_the_study_ends_with_answers_from_its_own_rows(small_chain):
     )
     assert f"of {whole} arcsec)" in lines[2]
     assert lines[-1].startswith("depth: ")
-
-
-def answered(given: answers.Given, rate_deg_s: float = 0.0, **errors: float) -> CombinationRow:
-    """The answer among planted rows: the error of each, arcsec, by codes, then `s` for bit
-    stealing and `t` for two samples.
-    """
-    rows = []
-    for name, arcsec in errors.items():
-        codes, _, flags = name.partition("_")
-        rows.append(
-            combination_row(
-                error_arcsec=arcsec,
-                error_mag=0.001,
-                quantisation=codes,
-                bit_stealing="true" if "s" in flags else "false",
-                prediction="two samples" if "t" in flags else "rate",
-                rate_deg_s=rate_deg_s,
-            )
-        )
-    return answers.simplest(answers.allowed(rows, given))
-
-
-def test_an_answer_is_the_simplest_that_is_near_the_best_of_what_is_given():
-    bare, known = answers.Given(False, True), answers.Given(True, True)
-    assert answered(bare, round=1.0, exact=0.2, exact_s=0.1).quantisation == "exact"
-    assert answered(bare, round=1.05, exact=1.0).quantisation == "round"
-    assert answered(bare, round=1.0, exact=0.2, exact_s=0.1).bit_stealing == "false"
-    assert answered(known, round=1.0, exact=0.2, exact_s=0.1).bit_stealing == "true"
-    assert answered(known, exact=0.105, exact_s=0.1).bit_stealing == "false"
-    assert answered(bare, temporal=0.01, dither=0.05, exact=0.2).quantisation == "exact"
-    turning = {"exact": 1.2, "exact_t": 0.7}
-    assert answered(answers.Given(False, True), 1.0, **turning).prediction == "rate"
-    assert answered(answers.Given(False, False), 1.0, **turning).prediction == "two samples"
-
-
-def test_a_cheaper_choice_whose_light_is_far_worse_is_no_answer():
-    rows = [
-        combination_row(
-            quantisation="round", bit_stealing="false", error_arcsec=1.0, error_mag=0.02
-        ),
-        combination_row(
-            quantisation="exact", bit_stealing="false", error_arcsec=1.0, error_mag=0.002
-        ),
-    ]
-    assert answers.simplest(rows).quantisation == "exact"
-
-
-def test_each_turn_is_named_from_which_another_step_is_most_of_the_error():
-    rows, budget = [], []
-    for scene, rate, largest in (
-        ("s", 0.0, "codes"),
-        ("a", 1.0, "prediction"),
-        ("b", 3.0, "prediction"),
-        ("c", 10.0, "refresh"),
-    ):
-        for prediction, arcsec in (("rate", 1.0), ("two samples", 2.0)):
-            errors = {"error_arcsec": arcsec, "bit_stealing": "false"}
-            rows.append(
-                combination_row(scene=scene, rate_deg_s=rate, prediction=prediction, **errors)
-            )
-        steps = {
-            step: 2.0 if step == largest else 0.5 for step in ("codes", "prediction", "refresh")
-        }
-        budget += [
-            measuring.ErrorPart(scene, "auto", step, size, 0.0)
-            for step, size in {**steps, "rss": 3.0, "whole": 2.5}.items()
-        ]
-    lines = answers.turn_lines(answers.scenes_of(rows)[1:], budget)
-    assert [line.split(" is ")[0] for line in lines] == [
-        "from 1 deg/s on prediction",
-        "from 10 deg/s on the panel's refresh",
-    ]
-    assert (
-        "2 of 2.5 arcsec): send rates (by the packets' rates 1, by two samples 2 arcsec)"
-        in lines[0]
-    )
 
 
 def number_of(row, name):
@@ -684,64 +520,6 @@ def test_a_frame_s_light_is_that_of_its_codes_on_its_own_pixels(tmp_path):
         assert wanted.sum() == pytest.approx(light.sum(), rel=1e-6)
 
 
-def test_why_auto_takes_no_better_choice_is_said_for_each_difference():
-    own = combination_row(bit_stealing="false", faintest_v_mag=9.0)
-    for changes, words in (
-        ({"bit_stealing": "true"}, "bit stealing is the bench file's choice"),
-        ({"prediction": "two samples"}, "prediction by two samples is the sender's choice"),
-        ({"faintest_v_mag": 8.0}, "the catalogue's depth is the bench file's choice"),
-        ({"quantisation": "temporal"}, "temporal is right over an exposure"),
-        ({"quantisation": "round"}, "effort compares exact and round by their worst star"),
-        ({"sprite": "coarse"}, "coarse sprites are beyond the tolerance"),
-        ({"sprite": "full"}, "cut sprites save nothing here"),
-        ({"smear": "point"}, "points instead of paths"),
-    ):
-        other = replace(own, **changes)
-        said = run.why_not(own, other)
-        assert said.startswith(words) and ";" not in said
-        both = run.why_not(own, replace(other, roll_arcsec=3.0))
-        assert both == said
-    held = replace(own, prediction="held")
-    assert (
-        run.why_not(held, own) == "[attitude] max_extrapolation_ms = 0 is the bench file's choice"
-    )
-    assert run.why_not(replace(own, sprite="coarse"), replace(own, sprite="coarse")) == ""
-
-
-def test_what_beats_auto_is_the_nearest_of_those_beyond_the_noise():
-    auto = combination_row(chosen="auto", time_ms=5.0, error_arcsec=2.0, bit_stealing="false")
-    slower = combination_row(time_ms=9.0, error_arcsec=1.0)
-    assert run.standing([auto, slower]) == "on the front"
-    within = combination_row(time_ms=4.99, error_arcsec=1.5, bit_stealing="false")
-    text = run.standing([auto, slower, within])
-    assert text.startswith("on the front within the noise: exact, cut sprites is 1.5 arcsec off")
-    assert "0.01 ms faster (noise 0.014 ms)" in text
-    stolen = combination_row(time_ms=2.0, error_arcsec=0.5, bit_stealing="true")
-    worse = combination_row(time_ms=1.0, error_arcsec=0.9, bit_stealing="true")
-    text = run.standing([auto, stolen, worse])
-    assert text.startswith("not on the front: exact with bit stealing, cut sprites is 0.5 arcsec")
-    assert "3 ms faster" in text and text.endswith("; on the front of what effort may choose")
-    assert run.standing([auto, stolen, within]).endswith("may choose, within the noise")
-    free = combination_row(time_ms=3.0, error_arcsec=1.9, bit_stealing="false", sprite="full")
-    text = run.standing([auto, stolen, free])
-    assert "; nor of what effort may choose: exact, full sprites is 1.9 arcsec off" in text
-    assert run.standing([auto, free]).count("not on the front") == 1
-    assert "nor of" not in run.standing([auto, free])
-
-
-def test_times_are_medians_and_quartiles_and_know_their_noise():
-    """Of a normal distribution the median of n is known to 1.2533 sigma / n^0.5."""
-    taken = np.array([[4.0, 40.0], [1.0, 10.0], [2.0, 30.0], [3.0, 20.0], [10.0, 0.0]])
-    times = measuring.times_of(taken)
-    assert (times.time_ms, times.iqr_ms, times.cpu_ms, times.frames) == (3.0, 2.0, 20.0, 5)
-    assert times.noise_ms == pytest.approx(1.2533 * 2 / 1.349 / math.sqrt(5), abs=1e-4)
-    assert measuring.noise_ends_ms(4.0, 1.0) == (3.0, 5.0)
-    assert measuring.noise_ends_ms(4.0, 3.0) == (2.0, 7.0)
-    assert measuring.rms_of_known([3.0, math.nan, 4.0]) == pytest.approx(math.sqrt(12.5))
-    assert math.isnan(measuring.rms_of_known([math.nan]))
-    assert measuring.rounded(0.0123456) == 0.01235 and math.isnan(measuring.rounded(math.nan))
-
-
 def test_each_chain_is_timed_in_each_round_and_one_by_its_stages():
     """After a frame that does not count; the rounds end with the time, but not before two."""
 
@@ -768,103 +546,37 @@ def test_each_chain_is_timed_in_each_round_and_one_by_its_stages():
         assert (taken.time_ms, taken.cpu_ms, taken.frames) == (chain.ms, 2 * chain.ms, visits)
 
 
-def test_a_psf_that_is_a_pixel_off_and_three_percent_too_bright_is_told_so(tmp_path, monkeypatch):
-    """Against the whole one, here a Gaussian of 1.2 px, by the tracker's own centroider."""
-    sigma_px, side = 1.2, 15
-    at = np.arange(side) - side // 2
-
-    def stamps(x_off_px, y_off_px):
-        across = np.exp(-((at - x_off_px[:, None]) ** 2) / (2 * sigma_px**2))
-        down = np.exp(-((at - y_off_px[:, None]) ** 2) / (2 * sigma_px**2))
-        light = down[:, :, None] * across[:, None, :] / (2 * math.pi * sigma_px**2)
-        light[0] = 0.0  # a star in a dark corner is not judged
-        return light
-
-    def unreduced(x_px, y_px, shares):
-        assert len(shares) == len(x_px)
-        return stamps(x_px - np.floor(x_px + 0.5), y_px - np.floor(y_px + 0.5))
-
-    def told(psf, corner, told_side, shares):
-        assert told_side == side and len(corner[0]) == len(corner[1]) == len(shares)
-        return lambda x_px, y_px: psf(stamps(x_px, y_px))
-
-    def glass(file, psf):
-        return SimpleNamespace(shares_of=lambda stars, hip: np.ones((len(hip), 1)))
-
-    monkeypatch.setattr(chain_glass, "told_psf", told)
-    monkeypatch.setattr(chain_glass, "StarGlass", glass)
-    whole = SimpleNamespace(footprint_px=side, width_px=(sigma_px, sigma_px), unreduced=unreduced)
-    psfs = {
-        "whole": lambda light: light,
-        "right": lambda light: 1.03 * np.roll(light, 1, axis=2),
-        "down": lambda light: 0.98 * np.roll(light, 2, axis=1),
+def test_a_psf_that_is_a_pixel_off_and_three_percent_too_bright_is_told_so(monkeypatch):
+    """Against the true one, here a Gaussian of 1.2 px, by the tracker's own centroider."""
+    sigma_px, at = 1.2, np.arange(15) - 7
+    x_px, y_px = np.array([0.0, 0.3, -0.4, 0.2, 0.1]), np.array([0.0, -0.2, 0.4, 0.1, 0.3])
+    across = np.exp(-((at - x_px[:, None]) ** 2) / (2 * sigma_px**2))
+    down = np.exp(-((at - y_px[:, None]) ** 2) / (2 * sigma_px**2))
+    light = down[:, :, None] * across[:, None, :] / (2 * math.pi * sigma_px**2)
+    light[0] = 0.0  # a star in a dark corner is not judged
+    stamps = {
+        "whole": light,
+        "right": 1.03 * np.roll(light, 1, axis=2),
+        "down": 0.98 * np.roll(light, 2, axis=1),
     }
-    with Simulator(small_file(tmp_path)) as tracker:
-        scene = ChainScene("Orion", "", np.array(ORION_Q))
-        errors = chain_glass._errors(tracker, whole, psfs, scene)
-        in_view = len(chain_glass.field_stars(tracker.stars, tracker.camera, scene.q_icrs_to_cam))
-        monkeypatch.setattr(chain_glass, "MIN_STARS", in_view)
-        assert chain_glass._errors(tracker, whole, psfs, scene) == {}
-        monkeypatch.setattr(chain_glass, "MIN_STARS", in_view - 1)
-        assert chain_glass._errors(tracker, whole, psfs, scene) == errors
-    arcsec_per_px = math.atan(13e-3 / 70) * ARCSEC_PER_RAD
-    assert {error.stars for error in errors.values()} == {in_view - 1}
+    find = partial(star_places, kind="window", sigma_px=(sigma_px, sigma_px))
+    errors = chain_glass.stamp_errors(light, stamps, find, 38.0)
     for name, off_px, percent in (("whole", 0, 0), ("right", 1, 3), ("down", 2, 2)):
         error = errors[name]
+        assert error.stars == 4
         # a window's edge sees a rolled star's wings otherwise
-        assert error.error_arcsec == pytest.approx(off_px * arcsec_per_px, rel=0.02, abs=1e-6)
+        assert error.error_arcsec == pytest.approx(off_px * 38.0, rel=0.02, abs=1e-6)
         assert error.error_percent == pytest.approx(percent, rel=1e-3, abs=1e-6)
         assert error.worst_percent == pytest.approx(percent, rel=1e-3, abs=1e-6)
+    monkeypatch.setattr(chain_glass, "MIN_STARS", 5)
+    assert chain_glass.stamp_errors(light, stamps, find, 38.0) == {}
 
 
-def glass_row(psf, error_arcsec, time_ms, **figures):
-    known = {field.name: 1.0 for field in fields(chain_glass.GlassRow)}
-    words = {"scene": "dense field", "stars": 30, "on_front": "false", "chosen": ""}
-    known |= words | {"psf": psf, "error_arcsec": error_arcsec, "time_ms": time_ms}
-    return chain_glass.GlassRow(**(known | figures))
-
-
-def test_the_psfs_of_a_glass_are_told_and_drawn_by_their_error_and_time():
-    rows = [
-        glass_row("a Gaussian", 12.0, 2.0, error_percent=3.0, noise_ms=0.5),
-        glass_row("a basis of 6", 0.125, 9.0, error_percent=0.4, chosen="auto", on_front="true"),
-        glass_row("the whole", 0.0, 40.0, error_percent=0.2, on_front="true"),
-    ]
-    line = chain_glass.glass_line(rows)
-    assert line.startswith(
-        "PSF of the tracker's glass, dense field, 30 stars: a Gaussian: 12 arcsec"
-    )
-    assert "a basis of 6 (auto): 0.12 arcsec, 0.4 %, 9 ms" in line
-    with charts.panels_of("A finding", 2, share_x=False) as (place, light):
-        draw_glass(place, light, rows)
-    colours = [chain_glass.colour_of(row) for row in rows]
-    assert colours == [charts.INK, charts.RED, charts.BLUE]
-    for axes, wanted in ((place, [12.0, 0.125, 0.125]), (light, [3.0, 0.4, 0.2])):
-        drawn = set()
-        for drawn_line in axes.get_lines():
-            drawn.update(zip(*map(np.ravel, drawn_line.get_data()), strict=True))
-        for row, error in zip(rows, wanted, strict=True):
-            # an error of 0 stands at the smallest other one, on a logarithmic axis
-            assert (row.time_ms, error) in drawn
-    assert "30 stars" in place.get_title() + place.get_title(loc="left")
-
-
-def test_what_depth_and_bit_stealing_bring_is_said_by_the_rows():
-    load = answers.Load()
-    deep = combination_row(faintest_v_mag=9.0, bit_stealing="false", error_arcsec=0.4, time_ms=2.0)
-    assert "9 was measured alone" in answers.depth_line([deep])
-    shallow = combination_row(faintest_v_mag=8.0, lost=3, stars=20, error_arcsec=0.6)
-    line = answers.depth_line([deep, shallow])
-    assert "keep faintest_v_mag = 9" in line and "loses 3 of 20 stars" in line
-    whole = replace(shallow, lost=0)
-    assert "faintest_v_mag = 8 is enough; it loses none of 20" in answers.depth_line([deep, whole])
-    assert "not on this panel" in answers.stealing_line([deep], deep, load)
-    stolen = replace(deep, bit_stealing="true", error_arcsec=0.1, time_ms=3.0)
-    line = answers.stealing_line([deep, stolen], deep, load)
-    assert line.endswith("takes 0.4 arcsec to 0.1 in 1.50 of the time, with exact")
-    same = replace(stolen, error_arcsec=0.39)
-    assert "brings nothing at rest" in answers.stealing_line([deep, same], deep, load)
-    assert "of the time" not in answers.stealing_line([deep, stolen], deep, answers.Load(1e3))
+def test_exposures_begin_at_their_own_frames(parts):
+    scene = SceneMeasurement(*parts, five_scenes(parts[0].own)[0], Rounds())
+    begins_s = [judge.seen.begin_s for judge in scene.judges]
+    assert begins_s == pytest.approx([number / 60 + 0.0037 for number in (20, 151, 325)])
+    assert scene.star_count == sum(map(len, scene.judges)) > len(scene.judges[0])
 
 
 def test_errors_without_times_are_those_of_every_choice(parts):
@@ -877,21 +589,6 @@ def test_errors_without_times_are_those_of_every_choice(parts):
         assert math.isnan(row.time_ms) and row.frames == 0
         assert row.error_arcsec == scene.error(combination).error_arcsec
         assert row.sprite == combination.sprite
-
-
-def test_a_panel_names_the_scenes_whose_error_is_alike(figures, tmp_path):
-    rows = []
-    for scene, arcsec in (("average field", 0.23), ("dense field", 0.235), ("faint field", 9.0)):
-        rows.append(combination_row(scene=scene, error_arcsec=arcsec, chosen="auto", stars=12))
-        rows.append(combination_row(scene=scene, error_arcsec=3 * arcsec, time_ms=2.0, stars=12))
-    run.draw(tmp_path / "c", rows, "A finding", "a machine", [])
-    (figure,) = figures
-    titles = [axes.get_title(loc="left") for axes in figure.axes]
-    assert titles == [
-        "Average field, 12 stars (the same in: dense field)",
-        "Faint field, 12 stars",
-    ]
-    assert "The line is the front" in " ".join(figure.get_supxlabel().split())
 
 
 def test_sprites_are_whole_cut_within_the_bench_s_tolerance_or_within_ten_times_that(parts):

@@ -13,7 +13,6 @@ from hilstar.instruments.simulate.budget import (
     budget,
     write_report,
 )
-from hilstar.instruments.study.economy import EffortComparison, EffortOutcome, economy_finding
 from hilstar.instruments.study.speed import report as benchmark_report
 from hilstar.instruments.study.speed.report import Machine, MethodTiming, Result, TimeSpread
 from hilstar.tracker.centroiders import FAMILY
@@ -87,42 +86,6 @@ def test_a_title_with_a_figure_that_is_not_drawn_is_seen():
         else:
             with pytest.raises(AssertionError, match=r"0\.16 of the title"):
                 assert_title_is_drawn(axes.figure, "planted")
-
-
-def outcome(frame_ms: float, worst_mag: float = 0.01, bits: int = 8) -> EffortOutcome:
-    errors = (worst_mag, 0.01, 0.02, 0.02, True, 5, *[0.01] * len(FAMILY))
-    return EffortOutcome(
-        "a scene", bits, "default", 0.05, 0.1, "round", 10, frame_ms, frame_ms, *errors
-    )
-
-
-@pytest.mark.parametrize(
-    ("times_ms", "said"),
-    [
-        (
-            ((2.0, 1.0), (10.0, 2.0)),
-            "At 8, 10 bits auto effort is 2.0, 5.0 times as fast as full effort (2.0 to 5.0 over",
-        ),
-        (
-            ((0.5, 1.0), (10.0, 2.0)),
-            "At 8, 10 bits auto effort is 0.5, 5.0 times as fast as full effort (0.5 to 5.0 over",
-        ),
-    ],
-)
-def test_economy_says_its_gain_by_bits_and_its_range(times_ms, said):
-    each = zip(times_ms, (8, 10), strict=True)
-    comparisons = [
-        EffortComparison(outcome(full, bits=bits), outcome(auto, bits=bits))
-        for (full, auto), bits in each
-    ]
-    finding = economy_finding(comparisons)
-    assert said in finding and finding.endswith("within tolerance")
-
-
-def test_economy_does_not_call_within_tolerance_what_is_over_it():
-    assert economy_finding([EffortComparison(outcome(2.0), outcome(1.0, 0.5))]).endswith(
-        "1 of 1 OVER tolerance"
-    )
 
 
 @pytest.mark.parametrize("sizes", [((1920, 1080),), ((640, 480), (1920, 1080))])

@@ -7,7 +7,6 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import asdict
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -26,18 +25,22 @@ from hilstar.instruments.study.colour import (
     light_by_primary,
     write_spectrum,
 )
+from hilstar.optics.sprites import pack_sprites
+from hilstar.server.bench.build import open_bench
 from hilstar.sky.spectral_types import LETTERS
 from tests.support.claims import holds
 from tests.support.recorded import assert_recorded, assert_row
+from tests.support.studies import times_are_watched
 
 AIM_SUBTYPES, AIM_PERCENT, AIM_LATERAL = 3.0, 2.0, 0.1
 
 
 @pytest.fixture(scope="module")
 def study(whole_study):
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, times_are_watched():
         patch.setattr(colour, "QUICK_ROUNDS", 1)  # no claim here is of a time
-        found = whole_study("colour", {"colour"})
+        measured = colour.measure(True)
+    found = whole_study.reported("colour", {"colour"}, measured)
     return found.folder, found.rows
 
 
@@ -167,10 +170,9 @@ def test_a_star_s_shift_by_its_colour_is_against_the_sun_s_at_the_same_place():
         red, blue = np.broadcast_to(spectra, (len(x_px), 2)).T
         return x_px + 0.01 * x_px * red, y_px - 0.5 * blue, red + blue
 
-    psf = SimpleNamespace(centroids_px=centroids_px)
     places_px = np.array([[100.0, 200.0, 50.0], [7.0, 8.0, 9.0]])
     spectra = np.array([[1.0, 0.0], [0.5, 0.5], [0.0, 1.0]])
-    moved = colour.moved_px(psf, places_px, spectra, 1)
+    moved = colour.moved_px(centroids_px, places_px, spectra, 1)
     np.testing.assert_allclose(moved, [[0.5, 0.0, -0.25], [0.25, 0.0, -0.25]], atol=1e-12)
     nm = np.array([[450.0], [600.0], [700.0]])
     np.testing.assert_allclose(colour.linear_px(nm, 1), [[-1.5, 0.0, 1.0]])
@@ -244,8 +246,10 @@ def test_the_chart_of_choices_has_a_point_of_each(figures, tmp_path):
             assert (fill == "none") == (row.method == "round")
 
 
-def test_a_study_s_tables_and_lines_are_of_what_each_part_measures(small_run, monkeypatch):
-    """The share of red light by class and the mosaic are measured here; the other parts planted."""
+def test_a_study_s_tables_and_lines_are_of_what_each_part_measures(small_run, tmp_path):
+    """The share of red light by class is measured here; the other parts are planted."""
+    colour.write_spectra(tmp_path)
+    red = colour.red_shares(tmp_path)
     gamut = [colour.GamutRow("OLED", "a", 1.0, 0.5, 0.25, 0.75, 3.0, 2.0, 9.0)]
     by_class = [colour.GamutClass("OLED", "a", "G", 7, 550.0, 2.0, 1.0, 8.0)]
     lateral = [colour.LateralColour("planar-1897", "OLED", "star", 0.02, 0.001, 0.05)]
@@ -256,23 +260,17 @@ def test_a_study_s_tables_and_lines_are_of_what_each_part_measures(small_run, mo
         choices.append(
             colour.ColourChoice(tracker, ink, method, 9, 3.0, 2.0 + number, number, 1, 1, 1, 1)
         )
-    asked = []
-
-    def study_choices(folder, trackers, fields, rounds):
-        asked.append((dict(trackers), fields, rounds))
-        return choices
-
-    monkeypatch.setattr(colour, "study_gamut", lambda folder: (gamut, by_class))
-    monkeypatch.setattr(colour, "study_lateral", lambda folder: lateral)
-    monkeypatch.setattr(colour, "study_choices", study_choices)
-    run = small_run(colour.run, True)
-    quick = {"mono": "ccd47-20", "Bayer": "Bayer, wide dyes"}
-    assert asked == [(quick, colour.QUICK_FIELDS, colour.QUICK_ROUNDS)]
+    mosaic = []
+    for sigma_px, image in itertools.product((0.55, 1.0, 1.5), ("mosaic", "superpixel")):
+        mosaic.append(colour.MosaicPlaces(sigma_px, 5000.0, image, sigma_px / 8, sigma_px / 4))
+    measured = colour.ColourMeasured(choices, gamut, by_class, lateral, red, mosaic, colour.Load())
+    run = small_run(colour.report, measured)
     for name, rows in (
         ("colour", choices),
         ("colour_gamut", gamut),
         ("colour_class", by_class),
         ("colour_lateral", lateral),
+        ("colour_mosaic", mosaic),
     ):
         written = run.rows(name)
         assert len(written) == len(rows)
@@ -280,16 +278,13 @@ def test_a_study_s_tables_and_lines_are_of_what_each_part_measures(small_run, mo
             assert list(row.values()) == [str(value) for value in asdict(planted).values()]
     assert "class" in run.rows("colour_class")[0]
     assert_recorded(run.folder / "colour_red.csv", ("sensor",), tuple("OBAFGKM"))
-    keys = ("sigma_px", "temperature_k", "image")
-    assert_recorded(run.folder / "colour_mosaic.csv", keys, ("rms_px", "max_px"))
     findings = run.told[0]
     assert findings[0] == run.title("colour")
     assert findings[1] == "lateral colour of planar-1897 by star on OLED: off by 5% of the sky's"
-    quoted = [row for row in run.rows("colour_mosaic") if row["sigma_px"] == "1.0"]
-    assert len(findings) == 2 + len(quoted) == 8
-    for line, row in zip(findings[2:], quoted, strict=True):
-        star = f"a star of 1 px, {float(row['temperature_k']):g} K"
-        assert line == f"{star}, is {float(row['rms_px']):.3f} px off rms in a {row['image']}"
+    assert findings[2:] == [
+        "a star of 1 px, 5000 K, is 0.125 px off rms in a mosaic",
+        "a star of 1 px, 5000 K, is 0.125 px off rms in a superpixel",
+    ]
 
 
 def test_a_dye_falls_to_one_over_e_at_its_half_width():
@@ -320,11 +315,7 @@ def test_light_by_primary_is_each_one_s_own_code(kind):
     if kind == "stealing":
         rgb = triples[0]
         levels = np.array([[0, 1]], dtype=np.uint16)
-    bench = SimpleNamespace(
-        config=SimpleNamespace(monitor=SimpleNamespace(bits=8)),
-        calibration=SimpleNamespace(response=SimpleNamespace(rgb=rgb)),
-    )
-    np.testing.assert_array_equal(light_by_primary(bench, levels), srgb.light[triples])
+    np.testing.assert_array_equal(light_by_primary(levels, 8, rgb), srgb.light[triples])
 
 
 def test_a_class_s_figures_are_of_its_own_stars():
@@ -332,13 +323,9 @@ def test_a_class_s_figures_are_of_its_own_stars():
     count = len(LETTERS)
     kinds = np.tile(np.arange(count, dtype=float), 2)
     figure = np.arange(2.0 * count)
-    stars = SimpleNamespace(
-        kinds=kinds,
-        wanted=np.stack([500 + figure, figure], axis=1),
-        off=figure,
-        subtypes=2 * figure,
-        subtypes_white=3 * figure,
-    )
+    wanted = np.stack([500 + figure, figure], axis=1)
+    errors = (figure, 2 * figure, 3 * figure)
+    stars = colour.GamutStars(kinds, wanted, *errors, 1.0, 0.0, 0.0)
     rows = class_rows("panel", "sensor", stars)
     assert [row.class_ for row in rows] == list(LETTERS)
     for place, row in enumerate(rows):
@@ -347,64 +334,49 @@ def test_a_class_s_figures_are_of_its_own_stars():
         assert (row.subtypes, row.subtypes_white) == (2 * mean, 3 * mean)
 
 
-def test_a_shown_star_s_place_and_light_are_of_its_primaries_where_they_stand(monkeypatch):
-    """Three stars, of which one is too bright to be judged and one too faint. Red stands a third of
-    a pixel to the left, blue as far to the right.
+def test_a_shown_star_s_place_and_light_are_of_its_primaries_where_they_stand():
+    """Three stars, of which two are not judged. Red stands a third of a pixel to the left, blue as
+    far to the right; white is 5, 3 and 2.
     """
-    monkeypatch.setattr(colour, "FRAME_PX", (120, 60))
     x_px, y_px = np.array([20.2, 60.4, 100.0]), np.array([30.1, 29.8, 30.0])
     levels = np.zeros((60, 120, 3), dtype=np.uint16)
     levels[30, 60] = 255, 255, 0
     levels[30, 61] = 0, 255, 255
     levels[30, [20, 100]] = 255
-    light = np.array([90.0, 40.0, 20.0])
-    bench = SimpleNamespace(
-        flux_at_white_e_per_s=10.0,
-        shown_stars=SimpleNamespace(v_mag=np.array([0.9, 3.0, 6.0]), electrons_per_s=light),
-        draw=lambda q: SimpleNamespace(levels=levels),
-        sprites=lambda q, stars: SimpleNamespace(
-            x_px=x_px, y_px=y_px, star=np.arange(3), data={"electrons_per_s": light}
-        ),
-        config=SimpleNamespace(monitor=SimpleNamespace(bits=8)),
-        calibration=SimpleNamespace(response=SimpleNamespace(rgb=None)),
-    )
-    places = np.array([[-1 / 3, 0.0], [0.0, 0.0], [1 / 3, 0.0]])
-    for mono in (True, False):
-        colours = SimpleNamespace(
-            of_white=np.array([0.5, 0.3, 0.2]),
-            mono=mono,
-            places_px=places,
-            wanted=lambda stars, numbers: np.array([[float(number)] for number in numbers]),
-        )
+    sprites = pack_sprites(x_px, y_px, np.array([90.0, 40.0, 20.0]), np.arange(3), (120, 60), 9)
+    images = light_by_primary(levels, 8, None) * [5.0, 3.0, 2.0]
+    places_px = np.array([[-1 / 3, 0.0], [0.0, 0.0], [1 / 3, 0.0]])
+    found = colour.lone_light(images, sprites, np.array([False, True, False]), places_px)
+    assert found.numbers.tolist() == [1]
+    # red once, green twice, blue once
+    by_primary = np.array([5.0, 6.0, 2.0])
+    np.testing.assert_allclose(found.by_primary, [by_primary])
+    middle_px = by_primary @ [60 - 1 / 3, 60.5, 61 + 1 / 3] / by_primary.sum()
+    np.testing.assert_allclose(found.off_px, [[middle_px - 60.4, 30 - 29.8]], atol=1e-5)
+    for mono, whole in ((True, 13.0), (False, 40.0)):
+        shares = colour.primary_shares(found.by_primary, np.array([40.0]), mono)
+        np.testing.assert_allclose(shares, [by_primary / whole])
+    assert len(colour.lone_light(images, sprites, np.zeros(3, bool), places_px).off_px) == 0
+
+
+def test_the_stars_of_several_frames_are_those_between_two_magnitudes(tmp_path):
+    """Each with its own colour, and near its own light."""
+    colour.write_spectra(tmp_path)
+    file = colour.file_of(tmp_path, "sRGB LCD", "Bayer, wide dyes", quantisation="exact")
+    with open_bench(file) as bench:
+        colours = colour.colours_of(file, bench.stars)
         shown = colour.shown_stars(bench, colours, 2)
-        assert shown.wanted.tolist() == [[1.0]] * 2
-        # red once, green twice, blue once
-        by_primary = np.array([5.0, 6.0, 2.0])
-        np.testing.assert_allclose(shown.light, by_primary.sum() / 40.0)
-        whole = by_primary.sum() if mono else 40.0
-        np.testing.assert_allclose(shown.shares, [by_primary / whole] * 2)
-        middle_px = by_primary @ [60 - 1 / 3, 60.5, 61 + 1 / 3] / by_primary.sum()
-        np.testing.assert_allclose(shown.off_px, [[middle_px - 60.4, 30 - 29.8]] * 2)
+        judged = colour.is_judged(bench.shown_stars.v_mag)
+        wanted = colours.wanted(bench.shown_stars, np.flatnonzero(judged))
+    assert len(shown.light) == len(shown.wanted) == len(shown.shares) == len(shown.off_px) > 10
+    np.testing.assert_allclose(shown.light, 1.0, atol=0.05)
+    assert {tuple(row) for row in shown.wanted} <= {tuple(row) for row in wanted}
+    ends_mag = np.array([colour.BRIGHTEST_V_MAG, colour.FAINTEST_V_MAG])
+    assert colour.is_judged(np.concatenate([ends_mag, ends_mag + 0.01])).tolist() == [
+        *(False, False, True, False)
+    ]
 
 
-def test_the_worst_place_in_a_mosaic_is_the_furthest_to_either_side(monkeypatch):
-    monkeypatch.setattr(colour, "SIGMAS_PX", (1.0,))
-    monkeypatch.setattr(colour, "STARS_K", (5000.0,))
-    off_px = {0: np.array([-0.3, 0.1]), 1: np.array([0.2, -0.1])}
-    widths_px = []
-
-    def planted(image, width_px, steps):
-        widths_px.append(width_px)
-        return off_px[len(widths_px) - 1]
-
-    monkeypatch.setattr(colour, "mosaic_off_px", planted)
-    channels = [
-        colour.Optics(30.0, *[colour.load_curve(name, name) for name in ("ccd47-20", "n-bk7-10mm")])
-    ] * 3
-    mosaic, superpixel = colour.study_mosaic(channels)
-    assert (mosaic.image, mosaic.max_px) == ("mosaic", 0.3)
-    assert mosaic.rms_px == pytest.approx(math.sqrt(0.05))
-    assert (superpixel.image, superpixel.max_px) == ("superpixel", 0.2)
-    # a superpixel's light spreads by the variance of its pixels
-    wide_px = math.sqrt(1 + colour.SUPERPIXEL_VARIANCE_PX2)
-    assert widths_px == pytest.approx([1.0, wide_px])
+def test_the_worst_place_in_a_mosaic_is_the_furthest_to_either_side():
+    row = colour.mosaic_places(1.0, 5000.0, "mosaic", np.array([-0.3, 0.1]))
+    assert (row.image, row.max_px, row.rms_px) == ("mosaic", 0.3, pytest.approx(math.sqrt(0.05)))

@@ -1,4 +1,4 @@
-"""`hilstar study`: in a process of its own, and what it refuses."""
+"""`hilstar study`: the thesis's outputs, those of a bench, and what it refuses."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from hilstar.sky.catalog import load_catalog
-from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.pictures import assert_drawn
 from tests.support.tables import csv_rows
 
@@ -101,22 +101,6 @@ def test_centres_are_astropy_s(published, name):
     x_px, y_px = plane.all_world2pix(ra_deg, dec_deg, 0)
     on = (x_px >= -0.5) & (x_px < shape[1] - 0.5) & (y_px >= -0.5) & (y_px < shape[0] - 0.5)
     assert int(on.sum()) == ON_IMAGE[name]
-
-
-@pytest.mark.usefixtures("whole_study")
-def test_a_bench_of_one_s_own_has_seven_outputs_in_four_fields(tmp_path):
-    (tmp_path / "bench.toml").write_text(BENCH)
-    result = run_hilstar(
-        "study", "outputs", tmp_path / "bench.toml", "--radec", "120,-45,10", "-o", tmp_path / "out"
-    )
-    assert result.returncode == 0, result.stderr
-    for stem in ("orion", "lyra", "zeta_cas", "field"):
-        assert_drawn(tmp_path / "out" / f"{stem}.png")
-        assert all((tmp_path / "out" / f"{stem}{ending}").is_file() for ending in IMAGES)
-        assert fits.getdata(tmp_path / "out" / f"{stem}.fits").shape == (600, 800)
-    header = fits.getheader(tmp_path / "out" / "field.fits")
-    middle = WCS(header).pixel_to_world(399.5, 299.5)
-    assert (middle.ra.deg, middle.dec.deg) == pytest.approx((120, -45), abs=1e-6)
 
 
 def test_rapp_of_a_bench_is_its_sensor_s(tmp_path):

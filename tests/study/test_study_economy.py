@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -10,15 +10,26 @@ import pytest
 from hilstar.instruments.study import economy
 from hilstar.instruments.study.economy import BITS, SCENES, TOLERANCES
 from hilstar.instruments.study.study_benches import LoneErrors, StarError
+from hilstar.instruments.study.sweep import Spent
 from hilstar.tracker.centroiders import FAMILY
 from tests.support.recorded import assert_recorded
+from tests.support.studies import times_are_watched
+
+# One that is at rest and one that turns, on the shallowest panel and the deepest; a scene without
+# many stars is the small one's below.
+CASES = tuple(product((8, 12), (SCENES[2], SCENES[4])))
+
+
+def measured(cases):
+    """The study's figures of these scenes, in one round: no claim here is of a time."""
+    with pytest.MonkeyPatch.context() as patch, times_are_watched():
+        patch.setattr(economy, "QUICK_ROUNDS", 1)
+        return economy.measure(True, cases)
 
 
 @pytest.fixture(scope="module")
 def economy_study(whole_study):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(economy, "QUICK_ROUNDS", 1)  # no claim here is of a time
-        found = whole_study("economy", {"economy"})
+    found = whole_study.reported("economy", {"economy"}, measured(CASES))
     return found.folder, found.findings, found.rows("economy")
 
 
@@ -49,32 +60,30 @@ def test_a_scene_that_needs_less_gets_it_and_stays_within_its_tolerance(economy_
 
 def test_what_is_within_by_the_plan_is_within_by_its_stars(economy_study):
     claimed = [row for row in economy_study[2] if row["claimed_within"].lower() == "true"]
-    assert len(claimed) > 20
+    assert len(claimed) > len(CASES)
     for row in claimed:
         assert float(row["flux_max_mag"]) <= float(row["tolerance_mag"])
         assert float(row["flux_max_mag"]) <= float(row["claimed_mag"])
         assert float(row["claimed_mag"]) <= float(row["tolerance_mag"])
 
 
-def test_the_study_has_five_scenes_of_three_depths_at_two_tolerances(economy_study):
+def test_each_scene_of_each_depth_is_told_at_two_tolerances(economy_study):
     _, lines, rows = economy_study
-    assert len(rows) == len(SCENES) * len(BITS) * (1 + len(TOLERANCES)) == 45
-    assert len([line for line in lines if " bits, " in line and "instead of" in line]) == 30
+    assert len(rows) == len(CASES) * (1 + len(TOLERANCES)) == 12
+    assert len([line for line in lines if " bits, " in line and "instead of" in line]) == 8
+    assert len(economy.CASES) == len(SCENES) * len(BITS) == 15 and set(CASES) < set(economy.CASES)
 
 
 def test_a_small_scene_has_the_recorded_errors_and_its_chart(small_run):
     """At rest and at 8 bits."""
-    scenes = SCENES[:1]
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in (("SCENES", scenes), ("BITS", (8,)), ("QUICK_ROUNDS", 1)):
-            patch.setattr(economy, name, value)
-        run = small_run(economy.run, True)
+    scene = SCENES[0]
+    run = small_run(lambda folder: economy.report(folder, measured([(8, scene)])))
     figures = ("stars", "flux_max_mag", "centroid_max_px", "claimed_mag", "claimed_px")
     figures += ("tolerance_mag", "tolerance_px", "measured_stars", "quantisation")
     figures += ("claimed_within", *(f"max_px_{kind}" for kind in FAMILY))
     assert_recorded(run.folder / "economy.csv", ("scene", "bits", "tolerance"), figures)
     rows = run.rows("economy")
-    assert [row["scene"] for row in rows] == 3 * [scenes[0].name]
+    assert [row["scene"] for row in rows] == 3 * [scene.name]
     # bars of both tolerances: full over auto, and the error over its limit
     for panel, heights in enumerate(("speed", "error")):
         containers = run.charts["economy"].axes[panel].containers
@@ -98,73 +107,37 @@ def test_a_small_scene_has_the_recorded_errors_and_its_chart(small_run):
         assert f"({float(row['max_px_fit']):.4f} by a PSF fit), within the tolerance" in line
 
 
-def test_an_outcome_has_the_worst_star_of_either_sign_and_the_median_time(monkeypatch):
+def test_an_outcome_has_the_worst_star_of_either_sign_and_the_median_time(bench_with):
     stars = (StarError(-0.03, 0.2), StarError(0.01, 0.5), StarError(0.02, 0.1))
     off_px = {}
     for number, kind in enumerate(FAMILY):
         off_px[kind] = np.array([[3.0, 0.0, 1.0], [-4.0, 2.0, 1.0]]) * (number + 1) / 100
-    monkeypatch.setattr(economy, "lone_errors", lambda *_: LoneErrors(stars, off_px))
-    asked = []
-
-    def draw(q, number, rate):
-        asked.append((q.tolist(), number, rate.tolist()))
-        return SimpleNamespace(levels="levels", star_count=77)
-
-    render = SimpleNamespace(quantisation="exact")
-    bench = SimpleNamespace(
-        draw=draw,
-        config=SimpleNamespace(monitor=SimpleNamespace(bits=10), render=render),
-        effort=SimpleNamespace(error_mag=0.04, error_px=0.08, within=False),
-    )
-    scene = SCENES[4]
-    times = [(9.0, 2.0), (1.0, 8.0), (4.0, 3.0)]
-    found = economy.outcome(scene, "0.1", bench, times)
+    errors = economy.FrameErrors(77, LoneErrors(stars, off_px))
+    bench = bench_with('[render]\nquantisation = "exact"\n')
+    times = [Spent(9.0, 2.0), Spent(1.0, 8.0), Spent(4.0, 3.0)]
+    found = economy.outcome(SCENES[4], "0.1", bench, errors, times)
     assert (found.frame_ms, found.cpu_ms) == (4.0, 3.0)
     assert (found.flux_max_mag, found.centroid_max_px) == (0.03, 0.5)
-    assert (found.claimed_mag, found.claimed_px, found.claimed_within) == (0.04, 0.08, False)
-    assert (found.stars, found.measured_stars, found.bits) == (77, 3, 10)
+    claimed = bench.effort
+    assert found.claimed_mag == claimed.error_mag and found.claimed_px == claimed.error_px
+    assert found.claimed_within == claimed.within and claimed.error_mag != claimed.error_px
+    assert (found.stars, found.measured_stars, found.bits) == (77, 3, bench.config.monitor.bits)
+    assert (found.scene, found.quantisation) == (SCENES[4].name, "exact")
     assert (found.tolerance, found.tolerance_mag, found.tolerance_px) == ("0.1", 0.1, 0.1)
     for number, kind in enumerate(FAMILY):
         assert getattr(found, f"max_px_{kind}") == pytest.approx(0.05 * (number + 1))
     assert found.worst_px == pytest.approx(0.05 * len(FAMILY))
     assert found.share == pytest.approx(0.5 * len(FAMILY)) and not found.within
-    assert asked == [(scene.turn.q_icrs_to_cam.tolist(), 0, np.radians([0.6, 0.8, 0.0]).tolist())]
     # full effort has the default's tolerance
-    assert economy.outcome(scene, "full", bench, times).tolerance_mag == economy.DEFAULT.mag
+    full = economy.outcome(SCENES[4], "full", bench, errors, times)
+    assert full.tolerance_mag == economy.DEFAULT.mag
 
 
-def test_a_scene_that_turns_is_drawn_along_its_paths_at_each_effort(monkeypatch):
+def test_a_scene_that_turns_is_drawn_along_its_paths_at_each_effort(bench_with):
     """And each bench has its scene's lens, stars and depth."""
-    tables_of = {}
-
-    class Planted:
-        def __init__(self, path, tables):
-            self.name = path.stem
-            tables_of[path.stem] = tables
-
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *raised):
-            pass
-
-    drawn = []
-
-    def in_turn(works, rounds):
-        for name, work in works.items():
-            work(3)
-            assert drawn[-1] == (name, 3)
-        return dict.fromkeys(works, rounds)
-
-    def frame_of(bench, turn, number):
-        drawn.append((bench.name, number))
-
-    monkeypatch.setattr(economy, "study_bench", Planted)
-    monkeypatch.setattr(economy, "in_turn", in_turn)
-    monkeypatch.setattr(economy, "frame_of", frame_of)
-    monkeypatch.setattr(economy, "outcome", lambda scene, name, bench, times: (name, times))
     for scene, motion in ((SCENES[0], "auto"), (SCENES[4], "on")):
-        assert economy.compare(scene, 12, 7) == [("full", 7), ("default", 7), ("0.1", 7)]
+        tables_of = economy.bench_tables(scene, 12)
+        assert list(tables_of) == ["full", "default", "0.1"]
         for name, tables in tables_of.items():
             assert tables["render"]["motion"] == motion
             assert tables["monitor"]["bits"] == 12
@@ -172,7 +145,26 @@ def test_a_scene_that_turns_is_drawn_along_its_paths_at_each_effort(monkeypatch)
             assert tables["collimator"] == {"focal_length_mm": scene.focal_length_mm}
             assert tables["render"]["quantisation"] == ("exact" if name == "full" else "auto")
             assert ("effort" in tables["render"]) == (name != "full")
-    assert tables_of["0.1"]["render"]["tolerance_mag"] == 0.1
+        assert tables_of["0.1"]["render"]["tolerance_mag"] == 0.1
+    bench, turn = bench_with('[render]\nmotion = "on"\nquantisation = "temporal"\n'), SCENES[4].turn
+    drawn = [economy.frame_of(bench, turn, number).levels.copy() for number in range(2)]
+    bench.renderer.begin_anew()
+    for number, levels in enumerate(drawn):
+        again = bench.draw(turn.q_icrs_to_cam, number, np.radians([0.6, 0.8, 0.0]))
+        np.testing.assert_array_equal(levels, again.levels)
+    assert (drawn[0] != drawn[1]).any()
+    bench.renderer.begin_anew()
+    assert (drawn[0] != bench.draw(turn.q_icrs_to_cam).levels).any()
+
+
+def test_each_effort_is_timed_by_its_own_bench(bench_with):
+    benches = {name: bench_with(f"[sky]\nfaintest_v_mag = {name}\n") for name in ("6", "4")}
+    works = economy.frame_works(benches, SCENES[0].turn)
+    for name, bench in benches.items():
+        drawn = works[name](0)
+        again = bench.draw(SCENES[0].turn.q_icrs_to_cam)
+        np.testing.assert_array_equal(drawn.levels, again.levels)
+    assert works["6"](0).star_count > works["4"](0).star_count
 
 
 def test_bars_have_room_over_the_highest_and_over_a_limit_of_one():

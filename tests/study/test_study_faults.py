@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from hilstar.basics.rotation import angle_between_rad, propagate
+from hilstar.cli.study import study_lines
 from hilstar.display.quantise import shown_light
 from hilstar.instruments.study import faults
 from hilstar.instruments.study.faults import CASES, NOWHERE, QUANTISATIONS, Stray
@@ -23,7 +24,7 @@ QUARTERS = ((UPPER, LEFT), (LOWER, LEFT), (UPPER, RIGHT), (LOWER, RIGHT))
 
 @pytest.fixture(scope="module")
 def faults_study(whole_study):
-    return whole_study("faults", {"faults", "faults_cost"})
+    return whole_study.reported("faults", {"faults", "faults_cost"}, faults.measure(quick=True))
 
 
 def test_every_kind_but_a_dropped_frame_has_its_cost(faults_study):
@@ -50,12 +51,9 @@ def test_stray_light_of_white_leaves_no_star_and_none_leaves_all(faults_study):
         assert int(mine[0.0]["stars"]) > 20
 
 
-def test_the_cost_of_a_fault_is_its_frame_less_the_same_frame_without_it(
-    bench_with, tmp_path, monkeypatch
-):
-    monkeypatch.setattr(faults, "medians_ms", lambda works, rounds: {"with": 7.0, "without": 5.0})
-    cost = faults.cost_of(bench_with(), tmp_path, "blank", 1)
-    assert (cost.case, cost.frame_ms, cost.without_ms, cost.cost_ms) == ("blank", 7.0, 5.0, 2.0)
+def test_the_cost_of_a_fault_is_its_frame_less_the_same_frame_without_it():
+    cost = faults.fault_cost("exact", "blank", {"with": 7.0, "without": 5.0})
+    assert cost == faults.FaultCost("exact", "blank", 7.0, 5.0, 2.0)
 
 
 def test_stray_light_spoils_from_the_least_share_beyond_which_stars_are_off():
@@ -159,7 +157,8 @@ def test_a_small_study_of_faults_draws_its_rows(small_run):
             ("QUICK_SHARES", (0.0, 0.02, 1.0)),
         ):
             patch.setattr(faults, name, value)
-        run = small_run(faults.run, True)
+        # as its command runs it
+        run = small_run(lambda folder: study_lines("faults", folder, quick=True))
     costs, strays = run.rows("faults-cost"), run.rows("faults-stray")
     assert [(row["quantisation"], row["case"]) for row in costs] == [
         (name, case) for name in QUANTISATIONS for case in cases
@@ -256,8 +255,6 @@ def test_the_charts_of_faults_say_their_slowest_frames(small_run):
     )
 
 
-def test_a_star_is_lost_that_is_a_magnitude_too_faint(monkeypatch, bench_with):
-    off_mag = [0.9, 1.1, 0.2, 0.6]
-    monkeypatch.setattr(faults, "light_errors_mag", lambda *measured: off_mag)
-    stray = faults.stray_light(bench_with(), 0.0)
+def test_a_star_is_lost_that_is_a_magnitude_too_faint():
+    stray = faults.stray_of("round", 0.0, [0.9, 1.1, 0.2, 0.6])
     assert (stray.lost, stray.median_mag, stray.stars) == (0.25, pytest.approx(0.75), 4)

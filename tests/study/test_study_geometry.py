@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
-import numpy as np
 import pytest
 
 from hilstar.instruments.study import geometry
@@ -65,25 +62,6 @@ def test_sets_of_frames_vary_noise_or_size_from_the_usual():
     assert {frames.count for frames in every} == {8, 10, 14, 20, 30}
     quick = geometry.frames_of(quick=True)
     assert quick == sorted([Frames(10, 25, 0.02), usual, Frames(20, 60, 0.2)])
-
-
-def test_a_shown_star_is_off_by_its_way_on_the_screen(monkeypatch):
-    """Of a bench whose pixels are a pinhole's, 5 to the right and 12 up."""
-    monitor = geometry._nominal().monitor
-    assert monitor.resolution_px == (1920, 1080)
-
-    def directions(x_px, y_px):
-        return monitor.rays(x_px + 5.0, y_px - 12.0) @ monitor.cam_to_image
-
-    shifted = SimpleNamespace(resolution_px=(1920, 1080), directions=directions)
-    nominal = geometry.Geometry(
-        monitor, geometry._nominal().q_cam_to_mon, geometry.TRACKER, np.eye(4)[:1]
-    )
-    monkeypatch.setattr(geometry, "BENCH", shifted)
-    errors_arcsec = geometry._star_errors(nominal)
-    assert len(errors_arcsec) == 4000
-    # a pixel of 57.65 um before 350 mm is 33.97 arcsec
-    np.testing.assert_allclose(errors_arcsec, 13 * 33.975, rtol=1e-4)
 
 
 def test_a_small_study_ranks_the_models_by_dots_as_by_stars(small_run, monkeypatch):

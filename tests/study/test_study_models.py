@@ -26,7 +26,6 @@ from hilstar.instruments.study.models import (
     zero_points,
 )
 from hilstar.instruments.study.rapp import SENSORS, rapp, rapp_ratios
-from hilstar.instruments.study.sky_figures import star_density
 from hilstar.instruments.study.study_benches import held_out_errors, study_optics
 from hilstar.sky import electrons
 from hilstar.sky.air import NIGHT_SKY
@@ -178,26 +177,13 @@ def test_rapp_is_what_equations_5_1_to_5_3_say(made, sensor, weighting, power):
 
 
 def test_rapp_is_one_where_both_models_are_the_same(made):
-    """RAPP1 at the reference's own temperature; and the thesis's '15 % up to 5 %' of hot stars
-    on the CCD47-20.
-    """
+    """RAPP1 at the reference's own temperature."""
     ratios = rapp_ratios(np.array([9602.0]), study_optics("ccd47-20"), "energy")
     assert ratios[0, 0] == pytest.approx(1.0, rel=1e-9)
     rows = made("rapp_ccd47-20").table("rapp_ccd47-20")
     kelvin, rapp3 = rows["temperature_k"], rows["rapp3_photon"]
     assert kelvin[0] == pytest.approx(3000) and kelvin[-1] == pytest.approx(50_000)
-    assert np.interp(9000, kelvin, rapp3) == pytest.approx(0.85, abs=0.01)
-    assert np.interp(50_000, kelvin, rapp3) == pytest.approx(0.97, abs=0.02)
     assert rapp3[0] > 1.7
-
-
-def test_the_zero_points_differ_by_a_third_of_a_magnitude(made):
-    table = made("zero_points").table("zero_points")
-    bolometric = [
-        setting == ("iau-bolometric", "energy")
-        for setting in zip(table["zero_point"], table["weighting"], strict=True)
-    ]
-    assert table["mag_against_default"][bolometric] == pytest.approx([0.31, 0.31], abs=0.01)
 
 
 def test_real_spectra_beat_black_bodies_in_the_chart_as_in_the_table(models_study):
@@ -243,7 +229,7 @@ def test_hot_stars_differ_as_the_thesis_says(made):
     off = 1 - table["rapp3_photon"][hot]
     assert off[0] == pytest.approx(0.15, abs=0.005)
     assert (np.diff(off) < 0).all()
-    assert 0 < off[-1] < 0.05
+    assert off[-1] == pytest.approx(0.03, abs=0.02)
 
 
 def test_the_source_s_step_is_in_the_table(made):
@@ -314,27 +300,6 @@ def test_choices_cost_what_a_bench_would_see(made):
     assert table["brightness_ags_mag"][row] == pytest.approx(ags_mag[0], abs=1e-4)
 
 
-def test_there_are_no_percentiles_where_stars_are_few():
-    bv_mag = np.concatenate([np.full(19, 0.0), np.full(20, 1.0)])
-    low, middle, high, count = running_percentiles(
-        bv_mag, np.arange(39.0), np.array([0.0, 1.0, 2.0])
-    )
-    assert count.tolist() == [19, 20, 0]
-    for values in (low, middle, high):
-        assert np.isnan(values).tolist() == [True, False, True]
-    assert middle[1] == pytest.approx(28.5)
-
-
-@pytest.mark.parametrize("sensor", HELD_OUT)
-def test_real_spectra_are_as_wrong_as_measured(models_study, sensor):
-    table = table_columns(models_study[0] / "spectra.csv")
-    assert len(table["spectral_type"]) == 106
-    errors = np.abs(table[f"{sensor}: pickles, leave-one-out [%]"][table["vi_mag"] < 2.5])
-    assert np.percentile(errors, (50, 95)) == pytest.approx(
-        HELD_OUT[sensor], abs=HUNDREDTH_OF_A_PERCENT
-    )
-
-
 def test_titles_say_what_the_tables_hold(made):
     for sensor in ("ccd47-20", "kai-4021"):
         table = made(f"rapp_{sensor}").table(f"rapp_{sensor}")
@@ -347,7 +312,9 @@ def test_titles_say_what_the_tables_hold(made):
             assert words in made(f"rapp_{sensor}").text
     zero = made("zero_points").table("zero_points")
     assert f"{zero['electrons_per_s'][0] / 1e6:.1f} million" in made("zero_points").text
-    assert f"({zero['mag_against_default'][2]:.2f} mag)" in made("zero_points").text
+    fewer_mag = zero["mag_against_default"][2]
+    fewer = f"{100 * (1 - 10 ** (-0.4 * fewer_mag)):.0f} % ({fewer_mag:.2f} mag) fewer"
+    assert fewer in made("zero_points").text
     flat = made("choices").table("choices")["zero_point_iau-bolometric_mag"]
     assert f"iau-bolometric {np.median(flat):.2f}" in made("choices").text
     assert choices_finding(
@@ -356,14 +323,6 @@ def test_titles_say_what_the_tables_hold(made):
         "zero changes most: half of Hipparcos to V = 7.5 by 0.31 mag and more; a twentieth are"
         " changed most by ags, by 0.32 mag"
     )
-
-
-def test_the_title_of_spectra_says_what_its_table_holds(models_study):
-    folder, texts = models_study
-    table = table_columns(folder / "spectra.csv")
-    for name in ("pickles, leave-one-out", "black body, ballesteros2012"):
-        errors = np.abs(table[f"kai-4021: {name} [%]"][table["vi_mag"] < 2.5])
-        assert "{:.1f} % ({:.1f} %)".format(*np.percentile(errors, (50, 95))) in texts["spectra"]
 
 
 def test_the_note_of_spectra_counts_those_beyond_its_dashed_line(made):
@@ -450,15 +409,17 @@ def test_the_stars_of_the_map_are_those_of_the_catalogue(made):
     square degrees.
     """
     table, catalog = made("star_density").table("star_density"), load_catalog()
-    cell_deg2 = 41_252.96 / len(table["ra_deg"])
+    count = len(table["ra_deg"])
+    assert count == 36 * 18
+    cell_deg2 = 41_252.96 / count
     assert table["stars_deg2"].sum() * cell_deg2 == pytest.approx(len(catalog), rel=1e-5)
-    k = int(table["stars_deg2"].argmax())
-    half = 1 / 18
-    middle = np.sin(np.radians(table["dec_deg"][k]))
-    near = (np.abs(catalog.ra_deg - table["ra_deg"][k]) < 5) & (
-        np.abs(np.sin(np.radians(catalog.dec_deg)) - middle) < half
-    )
-    assert table["stars_deg2"][k] * cell_deg2 == pytest.approx(near.sum(), abs=0.5)
+    height = np.sin(np.radians(catalog.dec_deg))
+    for k in (int(table["stars_deg2"].argmax()), *range(0, count, count // 12)):
+        across = np.abs(catalog.ra_deg - table["ra_deg"][k]) < 5
+        middle = np.sin(np.radians(table["dec_deg"][k]))
+        stars = (across & (np.abs(height - middle) < 1 / 18)).sum()
+        # a star or two stand on an edge to within a rounding
+        assert table["stars_deg2"][k] * cell_deg2 == pytest.approx(stars, abs=2)
 
 
 def test_the_camera_s_frame_is_astropy_s_tangent_plane(made):
@@ -533,38 +494,6 @@ def test_the_sun_s_type_and_vega_stand_beside_their_black_bodies(made):
     for at_nm in (350, 400, 900):
         share = (g2v["g2v"] / g2v["blackbody"])[g2v["wavelength_nm"] == at_nm][0]
         assert f"{share:.2f} at {at_nm} nm" in made("sun").text
-
-
-def test_the_bolometric_zero_point_has_a_quarter_fewer_electrons_than_vega(tmp_path, figures):
-    """A magnitude of 0 is 2.518021e-8 W/m2 (IAU 2015, resolution B2), of which a black body of
-    9602 K has the share of Planck's law at V's 551 nm, in place of Vega's 3.631e-2 W/m2/m.
-    """
-    peak = constants.h * constants.c / (551e-9 * constants.k * REFERENCE_K)
-    exitance = 2 * np.pi * constants.h * constants.c**2 / 551e-9**5 / np.expm1(peak)
-    share = exitance / (constants.sigma * REFERENCE_K**4)
-    fainter_mag = -2.5 * np.log10(2.518021e-8 * share / 3.631e-2)
-    text = zero_points(tmp_path).text
-    percent, mag = re.search(r"(\d+) % \((\S+) mag\) fewer", text).groups()
-    # V is 90 nm wide, over which the spectrum is bent: 0.02 mag
-    assert float(mag) == pytest.approx(fainter_mag, abs=0.02)
-    assert float(percent) == pytest.approx(100 * (1 - 10 ** (-0.4 * float(mag))), abs=1)
-    assert len(figures) == 1
-
-
-def test_a_cell_of_the_map_stands_at_its_middle_and_has_its_stars(tmp_path, figures):
-    star_density(tmp_path)
-    catalog = load_catalog()
-    rows = csv_rows(tmp_path / "star_density.csv")
-    assert len(rows) == 36 * 18 and len(figures) == 1
-    sky_deg2 = 4 * np.pi * np.degrees(1) ** 2
-    height = np.sin(np.radians(catalog.dec_deg))
-    for row in rows[:: len(rows) // 12]:
-        across = np.abs(catalog.ra_deg - float(row["ra_deg"])) < 5
-        middle = np.sin(np.radians(float(row["dec_deg"])))
-        inside = across & (np.abs(height - middle) < 1 / 18)
-        density = inside.sum() / (sky_deg2 / len(rows))
-        # a star or two stand on an edge to within a rounding
-        assert float(row["stars_deg2"]) == pytest.approx(density, abs=2 * len(rows) / sky_deg2)
 
 
 def mean_through_v(nm, values):

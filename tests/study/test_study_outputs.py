@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import re
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.wcs import WCS
 
+from hilstar.cli.study import thesis_lines
 from hilstar.instruments.study import outputs
 from hilstar.instruments.study.fields import fields_of
-from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.tables import csv_rows
 
 SIZE_PX = (220, 150)
@@ -51,7 +50,8 @@ def scenes(small_run, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         # the thesis's fields are as any other
         patch.setattr(outputs, "fields_of", lambda radec: fields_of(radec)[-2:])
-        return small_run(outputs.run, read_bench_file(path), FIELD)
+        # as its command writes them
+        return small_run(lambda folder: thesis_lines("outputs", path, folder, FIELD))
 
 
 def table_of(run):
@@ -174,39 +174,16 @@ def test_white_is_10_to_300_sigmas_of_the_sky_over_black(brightest_dn, noise_e, 
     """Of 8 e- and 4 e-/DN a sigma is 2 DN; of no noise it counts as 0.1 DN."""
     dn = np.full((50, 40), 100.0)
     dn[7] = brightest_dn
-    outputs_ = SimpleNamespace(noisy=SimpleNamespace(dn=dn), noise_e=noise_e, gain_e_per_dn=4.0)
-    assert outputs.stretch_dn(outputs_) == pytest.approx((100.0, white_dn))
+    assert outputs.stretch_dn(dn, noise_e, 4.0) == pytest.approx((100.0, white_dn))
 
 
-def test_a_zoom_is_about_its_star_or_the_brightest_or_the_middle():
-    kinds = [("hip", "i8"), ("name", "U8"), ("x_px", "f8"), ("y_px", "f8")]
-    truth = np.array([(7, "", 300.0, 2.0), (0, "Moon", 10.0, 20.0), (9, "", 30.0, 40.0)], kinds)
-    inside = np.array([False, True, True])
-    shown = SimpleNamespace(
-        truth=truth, inside=inside, noisy=SimpleNamespace(dn=np.zeros((100, 60)))
-    )
-    for hip, wanted in (
-        (None, ("Moon", (10.0, 20.0))),
-        (9, ("HIP 9", (30.0, 40.0))),
-        (7, ("the middle", (29.5, 49.5))),
-    ):
-        scene = outputs.OutputScene("s", "t", fields_of(None)[0], hip)
-        assert outputs._zoom(scene, shown) == wanted
-
-
-def test_the_thesis_s_fields_are_shown_as_published_and_mended(tmp_path, monkeypatch):
-    asked = []
-
-    def output(folder, file, scene):
-        asked.append((file.path.name, scene.stem, scene.field.name, scene.zoom_hip))
-        assert ("published" in scene.title) == scene.stem.endswith("_as_published")
-        return scene.stem
-
-    monkeypatch.setattr(outputs, "_output", output)
-    lines = outputs.run(tmp_path)
-    assert [stem for _, stem, *_ in asked] == lines
+def test_the_thesis_s_fields_are_shown_as_published_and_mended():
     wanted = []
     for stem, hip in (("orion", 26311), ("lyra", 92420), ("rosetta", 2920)):
         wanted.append((f"thesis-{stem}-as-published.toml", f"{stem}_as_published", hip))
         wanted.append((f"thesis-{stem}.toml", stem, hip))
-    assert [(name, stem, hip) for name, stem, _, hip in asked] == wanted
+    scenes = list(outputs.thesis_scenes())
+    assert [(name, scene.stem, scene.zoom_hip) for name, scene in scenes] == wanted
+    for _, scene in scenes:
+        assert ("published" in scene.title) == scene.stem.endswith("_as_published")
+        assert scene.field.name in scene.title

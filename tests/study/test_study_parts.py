@@ -5,7 +5,6 @@ attitudes of rigs, light over frames, predictors, lone stars, rays through a len
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -39,13 +38,10 @@ from hilstar.instruments.study import (
     study_benches,
     timing,
 )
-from hilstar.instruments.study.economy import EffortComparison
-from hilstar.instruments.study.outputs import _field_deg, thesis_total_e
-from hilstar.instruments.study.prediction import auto_times
 from hilstar.instruments.study.sweep import Spent, beaten_by, spent
 from hilstar.instruments.study.timing import stripe_depth
-from hilstar.optics.camera import Camera
 from hilstar.optics.frame_motion import CameraTurn
+from hilstar.optics.sprites import pack_sprites
 from tests.support.benches import ORION_Q, ROOT
 from tests.support.tables import csv_rows
 
@@ -208,12 +204,10 @@ def test_a_constant_acceleration_is_predicted_whole(load):
 
 def lone(x_px, y_px, light, star=None, margin_px=5.0, max_share=0.01, size_px=(100, 60)):
     """The lone stars of sprites, each with its window."""
-    data = np.zeros(len(x_px), dtype=[("electrons_per_s", "f8")])
-    data["electrons_per_s"] = light
     star = np.arange(len(x_px)) if star is None else np.array(star)
-    sprites = SimpleNamespace(data=data, star=star)
     isolation = study_benches.Isolation(margin_px, max_share)
     places = np.array(x_px, dtype=float), np.array(y_px, dtype=float)
+    sprites = pack_sprites(*places, np.array(light), star, size_px, 9)
     return list(study_benches.lone_windows(sprites, *places, size_px, isolation))
 
 
@@ -262,10 +256,8 @@ def test_a_star_s_error_is_its_light_in_magnitudes_and_its_way_in_pixels():
 
 
 def test_stars_that_show_nothing_are_as_far_off_as_a_study_counts():
-    data = np.zeros(2, dtype=[("electrons_per_s", "f8")])
-    data["electrons_per_s"] = [100.0, 50.0]
     places = np.array([30.0, 100.0]), np.array([30.0, 60.0])
-    sprites = SimpleNamespace(data=data, star=np.arange(2), x_px=places[0], y_px=places[1])
+    sprites = pack_sprites(*places, np.array([100.0, 50.0]), np.arange(2), (160, 120), 9)
     image = np.zeros((120, 160))
     image[30, 30] = 80.0
     errors_mag = faults.light_errors_mag(sprites, image, (160, 120))
@@ -333,38 +325,9 @@ def test_a_limb_is_where_light_has_fallen_to_half_of_the_inside():
 def test_stripes_are_told_apart_by_whole_refreshes():
     points = []
     for refreshes, light in ((2.0, 1.01), (2.0, 0.97), (2.5, 1.2), (2.5, 0.9)):
-        points.append(SimpleNamespace(refreshes=refreshes, light=light))
+        points.append(timing.StripePoint(refreshes, 1.0, 0, light, 1.0))
     assert stripe_depth(points, True) == pytest.approx(0.03)
     assert stripe_depth(points, False) == pytest.approx(0.2)
-
-
-def test_auto_is_held_against_the_better_of_both(monkeypatch):
-    rows = []
-    for way, residual in (("rate", 2.0), ("newest", 8.0), ("auto", 3.0)):
-        row = SimpleNamespace(way=way, residual=residual, packets="p", jitter_hz=1.0)
-        row.packet_hz, row.age_ms = 100, 20.0
-        rows.append(row)
-    monkeypatch.setattr("hilstar.instruments.study.prediction.is_usual", lambda hz, ms: True)
-    assert auto_times(rows) == pytest.approx(1.5)
-
-
-def test_a_speed_up_is_the_full_time_over_auto_s():
-    made = SimpleNamespace(full=SimpleNamespace(frame_ms=12.0), auto=SimpleNamespace(frame_ms=3.0))
-    assert EffortComparison.speed_up.fget(made) == 4.0
-
-
-def test_a_thesis_s_noise_is_of_its_exposure():
-    detector = SimpleNamespace(
-        prnu=0.01, dsnu_e_per_s=8.0, dark_e_per_s=20.0, adc_noise_e=3.0, read_noise_e=4.0
-    )
-    # 1000 e-, 20 * 0.5, 1000 * 0.01 + 8 * 0.5, 9 + 16
-    assert thesis_total_e(detector, 1000.0, 0.5) == pytest.approx(math.sqrt(1000 + 10 + 14 + 25))
-
-
-def test_a_field_is_from_edge_to_edge_of_its_outermost_pixels():
-    camera = Camera((800, 600), 1000.0, (399.5, 299.5), np.eye(3))
-    wanted = 2 * math.degrees(math.atan(0.4)), 2 * math.degrees(math.atan(0.3))
-    assert _field_deg(camera) == pytest.approx(wanted)
 
 
 def test_a_vibration_s_prediction_is_off_by_what_its_rate_leaves(monkeypatch):

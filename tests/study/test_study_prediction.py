@@ -38,12 +38,6 @@ from hilstar.instruments.study.predictors import (
 SLEW_PART_S = 2.0  # a tenth of the swing, from its fastest on
 
 
-@pytest.fixture(scope="module")
-def whole_prediction(whole_study):
-    found = whole_study("prediction", {"prediction", "prediction_jitter"})
-    return found.folder, found.findings
-
-
 def typed_rows(path, record):
     """A table as records of texts and numbers."""
     kinds = get_type_hints(record)
@@ -117,8 +111,10 @@ def test_auto_is_the_rate_where_vibrations_are_slow_and_damps_where_they_are_fas
     assert shaken_finding(list(shaken.values())).startswith("Of a vibration above 1")
 
 
-def test_the_study_writes_what_it_found(whole_prediction):
-    folder, lines = whole_prediction
+def test_the_study_writes_what_it_found(whole_study):
+    measured = prediction.measure(quick=True)
+    found = whole_study.reported("prediction", {"prediction", "prediction_jitter"}, measured)
+    folder, lines = found.folder, found.findings
     outcomes = by_cell(typed_rows(folder / "prediction.csv", PredictionOutcome))
     assert len(typed_rows(folder / "prediction_jitter.csv", Shaken)) > 20
     assert len(lines) == 1 + 5 + 1
@@ -233,31 +229,25 @@ def test_a_crossing_is_where_the_logarithms_of_frequencies_are_parted_by_the_err
     assert crossing_hz(rows[:6], "p", 100, 20) == math.inf
 
 
-def test_every_vibration_is_under_half_of_the_packets_rate_and_comes_with_and_without_rates(
-    monkeypatch,
-):
-    asked = []
-
-    def planted(way, jitter_hz, packet_hz, age_ms, has_rates):
-        asked.append((way, jitter_hz, packet_hz, age_ms, has_rates))
-        return jitter_hz / 100, age_ms / 100
-
-    monkeypatch.setattr(prediction, "shaken_error", planted)
-    rows = shaken_rows(quick=False)
+def test_every_vibration_is_under_half_of_the_packets_rate_and_comes_with_and_without_rates():
     wanted = set()
     for packet_hz, age_ms in prediction.SHAKEN_CELLS:
         for jitter_hz in (1, 2, 3, 5, 7, 10, 14, 20, 27, 35, 45):
             if 2 * jitter_hz < packet_hz:
-                for way in ("rate", "auto", "newest"):
-                    wanted |= {
-                        (way, jitter_hz, packet_hz, age_ms, rates) for rates in (True, False)
-                    }
-    assert len(asked) == len(wanted) and set(asked) == wanted
-    for row, (way, jitter_hz, packet_hz, age_ms, has_rates) in zip(rows, asked, strict=True):
-        packets = "with rates" if has_rates else "without rates"
-        assert row == Shaken(
-            way, packets, packet_hz, age_ms, jitter_hz, age_ms / 100, jitter_hz / 100
-        )
+                for way, packets in itertools.product(prediction.WAYS, prediction.SENDERS):
+                    wanted.add((way, packets, packet_hz, age_ms, jitter_hz))
+    cases = list(prediction.shaken_cases(quick=False))
+    assert len(cases) == len(wanted) and set(cases) == wanted
+    assert list(prediction.WAYS) == ["rate", "auto", "newest"]
+
+
+def test_a_vibration_s_row_is_its_case_with_its_own_error(shaken):
+    for (way, packets, hz), row in shaken.items():
+        if hz != 5:
+            continue
+        has_rates = packets == "with rates"
+        error = prediction.shaken_error(way, 5, row.packet_hz, row.age_ms, has_rates)
+        assert (row.residual, row.gain) == error
 
 
 def test_auto_is_told_by_the_vibration_at_which_it_is_worst():

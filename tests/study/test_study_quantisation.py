@@ -14,7 +14,7 @@ import pytest
 from hilstar.basics import charts
 from hilstar.display.phases import USUAL_PSF, fainter, measure, phase_grid
 from hilstar.display.render.reference import linear_image
-from hilstar.instruments.study import codes, quantisation, sweep
+from hilstar.instruments.study import codes, quantisation
 from hilstar.instruments.study.codes import (
     AIMS,
     BITS,
@@ -37,10 +37,10 @@ from hilstar.instruments.study.quantisation import (
     summary,
     timed_ways,
     times_line,
-    way_errors,
 )
 from hilstar.instruments.study.sweep import Load
 from hilstar.tracker.centroiders import FAMILY
+from tests.support.studies import times_are_watched
 from tests.support.tables import csv_rows
 
 # Of the error of `round` that `exact` leaves, by each centroider: 0.18 to 0.48 on 8 x 8 phases, 64
@@ -80,16 +80,27 @@ def test_fainter_stars_have_less_light():
     assert ratio == pytest.approx(np.full(4, 0.01))
 
 
-def test_the_command_has_a_finding_for_each_depth_and_times(whole_study):
-    charts = {"quantisation", "quantisation_centroiders", "quantisation_time", "over_frames"}
-    found = whole_study("quantisation", charts)
-    assert len(found.findings) == len(BITS) + 3
-    assert all(float(row["frame_ms"]) > 0 for row in found.rows("quantisation_time"))
+@pytest.fixture(scope="module")
+def measured():
+    """The quick study, whose times are of a small frame: no claim here is of a time."""
+    with pytest.MonkeyPatch.context() as patch, times_are_watched():
+        patch.setattr(codes, "FRAME_PX", (96, 54))
+        patch.setattr(quantisation, "QUICK_ROUNDS", 1)
+        return quantisation.measure(quick=True)
 
 
 @pytest.fixture(scope="module")
-def rows():
-    return way_errors(quick=True)
+def rows(measured):
+    return measured.rows
+
+
+CHARTS = {"quantisation", "quantisation_centroiders", "quantisation_time", "over_frames"}
+
+
+def test_a_whole_study_has_a_finding_for_each_depth_and_times(whole_study, measured):
+    found = whole_study.reported("quantisation", CHARTS, measured)
+    assert len(found.findings) == len(BITS) + 3
+    assert all(float(row["frame_ms"]) > 0 for row in found.rows("quantisation_time"))
 
 
 def largest(rows, bits, method, figure):
@@ -143,22 +154,13 @@ def test_the_faint_end_is_the_first_magnitude_at_it():
     assert faintest([WayErrors(8, "exact", 20.0, None), *made], 10, "exact") is made[1]
 
 
-def test_a_whole_study_has_quarters_of_a_magnitude_beyond_every_aim(monkeypatch):
-    asked = []
-
-    def planted(bits, way, phases, mags):
-        asked.append((bits, way.name, phases, list(mags)))
-        return mags
-
-    monkeypatch.setattr(codes, "code_errors", planted)
-    monkeypatch.setattr(codes, "error_figures", lambda errors: errors)
-    rows = way_errors(quick=False)
-    assert [(bits, name) for bits, name, *_ in asked] == list(
-        product(BITS, (way.name for way in WAYS))
-    )
-    quarters = [k / 4 for k in range(41)]
-    assert all(phases == 32 and mags == quarters for *_, phases, mags in asked)
-    assert all(row.mag_under_white == row.figures for row in rows)
+def test_a_whole_study_has_quarters_of_a_magnitude_beyond_every_aim(rows):
+    phases, mags = quantisation.phases_and_mags(quick=False)
+    assert phases == 32 and mags.tolist() == [k / 4 for k in range(41)]
+    wanted = []
+    for bits, way in product(BITS, WAYS):
+        wanted += [(bits, way.name, mag) for mag in (0.0, 2.0, 4.0, 6.0, 8.0)]
+    assert [(row.bits, row.method, row.mag_under_white) for row in rows] == wanted
 
 
 def timed_way(bits, method, frame_ms, **figures):
@@ -302,33 +304,32 @@ def test_errors_fall_with_the_frames_of_an_exposure():
     assert steps_words(replace(srgb, steps=100.4)) == "sRGB, 8 bits: 100 steps"
 
 
-def test_a_study_s_lines_and_tables_are_of_each_of_its_parts(rows, small_run, monkeypatch):
+def test_a_study_s_lines_and_tables_are_of_each_of_its_parts(rows, small_run):
     """Its times are planted, and what frames add up to."""
+    over_frames = []
+    for frames, panel in product((2, 6), ("coarse", "fine")):
+        over_frames.append(
+            codes.OverFrames(panel, 6.0, 9.0, "temporal", frames, 1 / frames, 0, 0, 0.01)
+        )
     timed = []
     for bits, way in product(BITS, WAYS):
         of_way = faintest(rows, bits, way.name).figures
         timed.append(TimedWay(bits, way.name, bits * 1.5, AIMS[bits][1], of_way))
-
-    def timed_ways(given, rounds):
-        assert (given, rounds) == (rows, quantisation.QUICK_ROUNDS)
-        sweep.spent(list)
-        return timed
-
-    monkeypatch.setattr(quantisation, "way_errors", lambda quick: rows)
-    monkeypatch.setattr(quantisation, "timed_ways", timed_ways)
-    monkeypatch.setattr(codes, "study_frames", lambda folder, quick: f"frames in {folder.name}")
-    run = small_run(quantisation.run, True)
+    measured = quantisation.QuantisationMeasured(rows, timed, Load(), over_frames)
+    run = small_run(quantisation.report, measured)
     lines, right = run.told
     wanted = [summary(bits, rows) for bits in BITS]
     wanted += [centroiders_line(centroider_errors(rows)), times_line(timed)]
-    assert (lines, right) == ([*wanted, f"frames in {run.folder.name}"], True)
+    of_frames = "coarse 0.17 mag, 0.01 px; fine 0.17 mag, 0.01 px"
+    wanted.append(f"temporal over any 6 frames, rms, places by a PSF fit: {of_frames}")
+    assert (lines, right) == (wanted, True)
+    assert len(run.rows("over_frames")) == len(over_frames)
     assert len(run.rows("quantisation")) == len(rows)
     written = run.rows("quantisation_time")
     assert [(int(row["bits"]), row["method"], float(row["frame_ms"])) for row in written] == [
         (row.bits, row.method, row.frame_ms) for row in timed
     ]
-    charts_of = {"quantisation", "quantisation_centroiders", "quantisation_time"}
-    assert set(run.charts) == charts_of
+    assert set(run.charts) == CHARTS
 
 
 def test_errors_over_frames_are_rms_over_where_an_exposure_begins(monkeypatch):
@@ -399,9 +400,7 @@ def test_the_finding_over_frames_is_of_temporal_at_the_frames_of_the_aim(
                 yield codes.OverFrames(panel.name, 6.0, 9.0, method, frames, mag, 7, 7, mag / 2)
 
     monkeypatch.setattr(codes, "over_frames", planted)
-    told = []
-    small_run(lambda folder: told.append(codes.study_frames(folder, quick)))
-    (finding,) = told
+    finding = small_run(codes.report_frames, codes.measure_frames(quick)).told
     assert asked == [(phases, count)] * 5
     assert finding == (
         "temporal over any 6 frames, rms, places by a PSF fit: sRGB, 8 bits 0.16 mag, 0.08 px;"

@@ -25,44 +25,48 @@ FACTOR = 2.5
 GRID_PX = 1e-9
 
 
+# Fewer exposures and trials: what they measure is near what is recorded of the whole study.
+SMALL = (("QUICK_EXPOSURES", 2), ("TRIALS", 200), ("LIGHTS_DN", (34.0, 80.0)))
+
+
+def test_a_whole_study_draws_its_chart(whole_study, monkeypatch):
+    for name, value in SMALL:
+        monkeypatch.setattr(rigs, name, value)
+    assert whole_study("rigs", {"rigs"}).rows("rigs")
+
+
 @pytest.fixture(scope="module")
-def rigs_study(whole_study):
-    found = whole_study("rigs", {"rigs"})
-    return found.folder, found.findings, {row["figure"]: row for row in found.rows("rigs")}
+def recorded():
+    """Published, predicted and with hilstar's codes, by figure, of the whole study."""
+    names = ("published", "predicted", "with_hilstar")
+    rows = csv_rows(ROOT / "results" / "rigs.csv")
+    return {row["figure"]: tuple(float(row[name]) for name in names) for row in rows}
 
 
-def figures(rigs_study, figure):
-    row = rigs_study[2][figure]
-    return tuple(float(row[name]) for name in ("published", "predicted", "with_hilstar"))
-
-
-def test_one_pixel_a_star_leaves_a_pixel_s_own_error_and_hilstar_s_codes_a_hundredth(rigs_study):
-    _, lines, rows = rigs_study
-    assert len(lines) == 1 + len(rows)
-    published, predicted, after = figures(rigs_study, "places, one pixel a star")
+def test_one_pixel_a_star_leaves_a_pixel_s_own_error_and_hilstar_s_codes_a_hundredth(recorded):
+    published, predicted, after = recorded["places, one pixel a star"]
     assert predicted == pytest.approx(PIXEL_ARCSEC, rel=EVEN)
     assert published == pytest.approx(PIXEL_ARCSEC, rel=EVEN)
     assert after < CODES_ARCSEC
-    assert figures(rigs_study, "light, hilstar's codes")[1] < CODES_MAG
+    assert recorded["light, hilstar's codes"][1] < CODES_MAG
 
 
-def test_one_light_of_a_star_predicts_all_static_scatters(rigs_study):
+def test_one_light_of_a_star_predicts_all_static_scatters(recorded):
     for name in rigs.SCATTER_ARCSEC:
         for what in ("about", "across"):
             fitted = " (fitted)" if (name, what) == (rigs.FITTED, "across") else ""
-            published, predicted, after = figures(
-                rigs_study, f"static scatter {what}, {name}{fitted}"
-            )
+            figure = f"static scatter {what}, {name}{fitted}"
+            published, predicted, after = recorded[figure]
             assert 1 / FACTOR < predicted / published < FACTOR
             # a display that stands still scatters nothing: it is the camera's own
             assert after == pytest.approx(predicted, rel=0.5)
-    assert figures(rigs_study, "constant error of an attitude, across")[1] > 1.0
-    assert figures(rigs_study, "constant error of an attitude, across")[2] < 0.05
+    assert recorded["constant error of an attitude, across"][1] > 1.0
+    assert recorded["constant error of an attitude, across"][2] < 0.05
 
 
-def test_pixels_explain_naples_s_tracking(rigs_study):
+def test_pixels_explain_naples_s_tracking(recorded):
     for what in ("about", "across"):
-        published, predicted, _ = figures(rigs_study, f"precision of tracking {what}")
+        published, predicted, _ = recorded[f"precision of tracking {what}"]
         assert published / 2 < predicted < published
 
 
@@ -78,13 +82,6 @@ def test_a_gaussian_on_no_background_is_found_exactly_by_its_grid():
 
 
 LASSI_PX_A_RADIAN = 350 / 57.65109021605092e-3
-
-
-def recorded_figures():
-    """Published, predicted and with hilstar's codes, by figure, of the whole study."""
-    names = ("published", "predicted", "with_hilstar")
-    rows = csv_rows(ROOT / "results" / "rigs.csv")
-    return {row["figure"]: tuple(float(row[name]) for name in names) for row in rows}
 
 
 def test_the_rig_sees_the_stars_about_the_pole_in_the_middles_of_its_panel_s_pixels():
@@ -121,24 +118,25 @@ def test_the_light_of_a_scatter_lies_between_its_neighbours_by_logarithms():
     )
 
 
-def test_a_static_scatter_is_that_recorded_of_more_exposures():
+def test_a_static_scatter_is_that_recorded_of_more_exposures(recorded):
     """Of 8 exposures a sigma is known to 27 %, the rms of two to 19 %."""
-    then = recorded_figures()
-    light_dn = then["light of a star (fitted)"][1]
+    light_dn = recorded["light of a star (fitted)"][1]
     field = rigs.rig_field()
     scatter = rigs.scatter_arcsec(field, field.pixel_px, light_dn, 8)
     for name, arcsec in scatter.items():
         fitted = " (fitted)" if name == rigs.FITTED else ""
-        assert 0.4 < arcsec[0] / then[f"static scatter about, {name}"][1] < 1.8
+        assert 0.4 < arcsec[0] / recorded[f"static scatter about, {name}"][1] < 1.8
         across_arcsec = math.sqrt((arcsec[1] ** 2 + arcsec[2] ** 2) / 2)
-        assert 0.5 < across_arcsec / then[f"static scatter across, {name}{fitted}"][1] < 1.6
+        assert 0.5 < across_arcsec / recorded[f"static scatter across, {name}{fitted}"][1] < 1.6
 
 
-def test_a_small_study_has_each_published_figure_beside_its_prediction(small_run, monkeypatch):
-    for name, value in (("QUICK_EXPOSURES", 2), ("TRIALS", 200), ("LIGHTS_DN", (34.0, 80.0))):
+def test_a_small_study_has_each_published_figure_beside_its_prediction(
+    small_run, monkeypatch, recorded
+):
+    for name, value in SMALL:
         monkeypatch.setattr(rigs, name, value)
     run = small_run(rigs.run, True)
-    rows, then = run.rows("rigs"), recorded_figures()
+    rows, then = run.rows("rigs"), recorded
     assert [row["figure"] for row in rows] == list(then)
     now = {}
     for row in rows:

@@ -18,14 +18,14 @@ from hilstar.instruments.study.timing import (
     TimingSky,
     compare,
     frame_weights,
-    measure,
     slew,
 )
 from hilstar.optics.scan import Scan
 from hilstar.server.sync import ARCSEC_PER_DEG, Exposures, seen_at
 from tests.support.benches import ROOT
 from tests.support.recorded import assert_recorded
-from tests.support.tables import csv_rows
+from tests.support.studies import times_are_watched
+from tests.support.tables import csv_numbers
 
 GAIN = 20  # compensated against not: the issue's own figure
 RATE_DEG_S = QUICK_RATES_DEG_S[0]
@@ -40,28 +40,21 @@ FRAME_ARCSEC = RATE_DEG_S * PERIOD_S * 3600
 @pytest.fixture(scope="module")
 def small(small_run):
     """The quick study, whose times are of one frame; and what it measured."""
-    measured = []
-
-    def keep(quick):
-        measured.extend(measure(quick))
-        return measured
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(timing, "measure", keep)
+    with pytest.MonkeyPatch.context() as patch, times_are_watched():
         patch.setattr(timing, "COST_ROUNDS", 1)
-        run = small_run(timing.run, True)
-    return run, measured
+        measured = timing.measure(True)
+    return small_run(timing.report, measured), measured
 
 
 @pytest.fixture(scope="module")
 def timing_study(small):
-    """The study's folder and findings, and what it measured."""
+    """The study's folder and findings, and its slews."""
     run, measured = small
-    return run.folder, run.told[0], measured
+    return run.folder, run.told[0], measured.outcomes
 
 
-def test_the_command_draws_its_three_charts(whole_study):
-    assert whole_study("timing", {"timing", "stripes", "beat"}).rows("timing")
+def test_a_whole_study_draws_its_three_charts(whole_study, small):
+    assert whole_study.reported("timing", {"timing", "stripes", "beat"}, small[1]).rows("timing")
 
 
 @pytest.fixture(scope="module")
@@ -124,10 +117,7 @@ def test_each_way_has_a_finding_and_a_row(timing_study):
 
 
 def test_rows_of_a_rolling_shutter_have_the_stripes_that_are_foretold(timing_study):
-    rows = [
-        {name: float(value) for name, value in row.items()}
-        for row in csv_rows(timing_study[0] / "stripes.csv")
-    ]
+    rows = csv_numbers(timing_study[0] / "stripes.csv")
     assert max(abs(row["light"] - row["foretold"]) for row in rows) < 1e-6
     deep = [row["light"] for row in rows if row["refreshes"] == 2.4 and row["lit_ms"] == 4]
     assert max(deep) > 1.2 and min(deep) < 0.9
@@ -138,10 +128,7 @@ def test_rows_of_a_rolling_shutter_have_the_stripes_that_are_foretold(timing_stu
 
 def test_a_tracker_sees_the_beat_that_is_foretold(timing_study):
     """Star by star, each on a row of its own phase; and of another phase it would not be."""
-    rows = [
-        {name: float(value) for name, value in row.items()}
-        for row in csv_rows(timing_study[0] / "beat.csv")
-    ]
+    rows = csv_numbers(timing_study[0] / "beat.csv")
     for case in QUICK_CASES:
         mine = [row for row in rows if (row["refreshes"], row["lit"]) == (case.refreshes, case.lit)]
         assert len(mine) > 30
@@ -167,8 +154,7 @@ def test_an_angle_on_the_tracker_is_that_of_its_own_lens(outcomes):
 
 def test_the_charts_of_timing_draw_the_rows(small):
     run, measured = small
-    beat = [{name: float(x) for name, x in row.items()} for row in run.rows("beat")]
-    stripes = [{name: float(x) for name, x in row.items()} for row in run.rows("stripes")]
+    beat, stripes = (csv_numbers(run.folder / f"{name}.csv") for name in ("beat", "stripes"))
     for panel, name in enumerate(("off_arcsec", "light_mag")):
         lines = run.lines("beat", panel)
         for case in QUICK_CASES:
@@ -199,10 +185,10 @@ def test_the_charts_of_timing_draw_the_rows(small):
         assert set(np.diff(x)) == {16.0} and 50 < len(x) <= 64
     parted = max(abs(row["light"] - 1) for row in stripes if row["refreshes"] % 1)
     assert f"up to {100 * parted:.0f} % of its light, 0 % where" in run.title("stripes")
-    arcsec = {outcome.way: outcome.rms_arcsec for outcome in measured}
+    arcsec = {outcome.way: outcome.rms_arcsec for outcome in measured.outcomes}
     assert f"off by {arcsec['prediction']:.2g} arcsec rms with prediction" in run.title("timing")
     assert run.told[0][0] == run.title("timing")
-    for outcome, line in zip(measured, run.told[0][1:], strict=False):
+    for outcome, line in zip(measured.outcomes, run.told[0][1:], strict=False):
         assert line.startswith(f"{outcome.way}: {outcome.rms_arcsec:.3g} arcsec rms, ")
     off = [row["off_arcsec"] - row["foretold_arcsec"] for row in beat]
     assert f"within {np.sqrt(np.mean(np.square(off))):.2g} arcsec rms" in run.title("beat")
@@ -212,16 +198,11 @@ def test_stripes_are_of_the_display_s_rows_behind_the_rows_of_the_tracker(small)
     """Rows of 16 us and a scan-out of a refresh over the screen: a row begins late by its own time
     less that of its place on the screen; between the middle rows nothing is late.
     """
-    stripes = [{name: float(x) for name, x in row.items()} for row in small[0].rows("stripes")]
-    recorded = {}
-    for row in csv_rows(ROOT / "results" / "stripes.csv"):
-        recorded[row["refreshes"], row["lit_ms"], row["row"]] = float(row["light"])
-    same = 0
-    for row, text in zip(stripes, small[0].rows("stripes"), strict=True):
-        key = text["refreshes"], text["lit_ms"], text["row"]
-        assert row["light"] == pytest.approx(recorded[key], abs=1e-6)
-        same += 1
-    assert same == len(recorded)
+    now, then = (
+        {(row["refreshes"], row["lit_ms"], row["row"]): row["light"] for row in csv_numbers(path)}
+        for path in (small[0].folder / "stripes.csv", ROOT / "results" / "stripes.csv")
+    )
+    assert now == pytest.approx(then, abs=1e-6)
 
 
 def test_a_case_s_line_has_its_largest_errors_beside_those_foretold():

@@ -28,11 +28,10 @@ from hilstar.display.render.variants import SplatVariant, VariantRenderer
 from hilstar.instruments.study import sweep, trials
 from hilstar.instruments.study.codes import star_field
 from hilstar.instruments.study.predictors import ORION, predictors, slew_attitude, slew_sample
-from hilstar.instruments.study.sweep import MAX_ROUNDS, MIN_ROUNDS, Load, in_turn, pareto_front
+from hilstar.instruments.study.sweep import MAX_ROUNDS, MIN_ROUNDS, Load, in_turn
 from hilstar.instruments.study.tradeoff import light, places
 from hilstar.instruments.study.tradeoff import run as tradeoff
 from hilstar.instruments.study.tradeoff.light import (
-    LIMITS_V_MAG,
     gauss,
     sampled_flux,
     shared_knots,
@@ -43,7 +42,6 @@ from hilstar.instruments.study.tradeoff.places import (
     EXACT_NODES,
     GAUSS,
     SPRITE_PSF,
-    smear_methods,
 )
 from hilstar.instruments.study.tradeoff.run import STEPS
 from hilstar.instruments.study.trials import (
@@ -51,6 +49,7 @@ from hilstar.instruments.study.trials import (
     Trial,
     Trials,
     draw_trials,
+    judged,
     measured,
     ms_words,
     table_lines,
@@ -61,6 +60,7 @@ from hilstar.sky.electrons import TABLE_DEGREE
 from hilstar.sky.spectrum import Curve
 from hilstar.sky.stars import CELL_DEG
 from tests.support.benches import ROOT
+from tests.support.studies import times_are_watched
 from tests.support.tables import csv_rows
 
 NAMES = [
@@ -85,27 +85,26 @@ PROFILE_SHARE = 2e-7
 
 
 @pytest.fixture(scope="module")
-def small(small_run):
+def steps_measured():
     """Every step with one round; of those that draw at chance, fewer places than the page's."""
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, times_are_watched():
         patch.setattr(tradeoff, "QUICK_BUDGET_S", 0.0)  # no claim here is of a time
         patch.setattr(sweep, "MIN_ROUNDS", 1)
-        return small_run(tradeoff.run, True)
+        return tradeoff.measure(quick=True)
 
 
 @pytest.fixture(scope="module")
-def tradeoff_study(small):
+def tradeoff_study(small_run, steps_measured):
+    small = small_run(tradeoff.report, steps_measured)
     rows = small.rows("tradeoff")
     lines, _ = small.told
     steps = {name: {r["method"]: r for r in rows if r["step"] == name} for name in NAMES}
     return small.folder, lines, steps
 
 
-def test_the_command_writes_every_step(whole_study):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tradeoff, "QUICK_BUDGET_S", 0.0)
-        patch.setattr(sweep, "MIN_ROUNDS", 1)
-        found = whole_study("tradeoff", {f"tradeoff_{name}" for name in NAMES})
+def test_a_whole_study_draws_every_step(whole_study, steps_measured):
+    charts_of = {f"tradeoff_{name}" for name in NAMES}
+    found = whole_study.reported("tradeoff", charts_of, steps_measured)
     assert {row["step"] for row in found.rows("tradeoff")} == set(NAMES)
 
 
@@ -177,7 +176,7 @@ def test_a_prediction_s_errors_are_those_of_its_samples():
 
 
 def test_predictions_are_told_by_their_worst_and_rms_and_timed_after_the_last_sample_but_one(
-    tradeoff_study, monkeypatch
+    tradeoff_study,
 ):
     samples = [slew_sample(k * 50_000_000) for k in range(200)]
     steps = tradeoff_study[2]["prediction"]
@@ -186,39 +185,23 @@ def test_predictions_are_told_by_their_worst_and_rms_and_timed_after_the_last_sa
         row = steps[predictor.name]
         assert float(row["error"]) == pytest.approx(max(errors))
         assert float(row["second"]) == pytest.approx(math.sqrt(np.mean(np.square(errors))))
-    timed = []
-    monkeypatch.setattr(places, "slew_sample", lambda t_ns: samples[t_ns // 50_000_000])
-    monkeypatch.setattr(places, "prediction_errors", lambda predictor, samples: [1.0])
-    monkeypatch.setattr(places, "attitudes_at", lambda attitude_at, times: timed.append(times))
-    with ExitStack() as stack:
-        for trial in places.prediction(stack, True).trials:
-            trial.work()
-    for times_ns in timed:
-        assert len(times_ns) == 60
-        assert (times_ns[0], times_ns[-1]) == (samples[-2].t_ns, samples[-1].t_ns)
+    times_ns = places.moments_ns(samples)
+    assert len(times_ns) == 60
+    assert (times_ns[0], times_ns[-1]) == (samples[-2].t_ns, samples[-1].t_ns)
 
 
-def test_each_field_s_stars_are_those_near_its_own_boresight(monkeypatch):
-    fields = []
-
-    def in_fields(road, near, turns, camera):
-        fields.append((near, turns))
-        return np.zeros((sum(map(len, near)), 2))
-
-    monkeypatch.setattr(places, "places_in_fields", in_fields)
-    with ExitStack() as stack:
-        step = places.projection(stack, True)
+def test_each_field_s_stars_are_those_near_its_own_boresight(tradeoff_study):
     camera = places.ideal_monitor(places.demo_config())
-    cos_field = math.cos(camera.field_radius_rad(0.0))
-    assert len(fields) == 1 + len(places.ROADS)
-    for near, turns in fields:
-        assert len(near) == len(turns) == 6
-        for vectors, turn in zip(near, turns, strict=True):
-            cosines = vectors @ turn[2]
-            # cells that reach into the field may end some degrees beyond it
-            assert (cosines > cos_field).sum() > 100
-            assert cosines.min() > math.cos(math.acos(cos_field) + math.radians(10))
-    assert step.work.startswith(f"{len(fields[0][0][0])} stars near the field to sprites")
+    turns = places.random_turns(6, camera)
+    radius_rad = camera.field_radius_rad(0.0)
+    near = places.stars_near(places.stars_to(places.NO_LIMIT_V_MAG), turns, radius_rad)
+    for vectors, turn in zip(near, turns, strict=True):
+        cosines = vectors @ turn[2]
+        # cells that reach into the field may end some degrees beyond it
+        assert (cosines > math.cos(radius_rad)).sum() > 100
+        assert cosines.min() > math.cos(radius_rad + math.radians(10))
+    row = next(iter(tradeoff_study[2]["projection"].values()))
+    assert row["work"].startswith(f"{len(near[0])} stars near the field to sprites")
 
 
 def test_extended_precision_knows_places_between_those_of_float64():
@@ -235,7 +218,7 @@ def test_extended_precision_knows_places_between_those_of_float64():
     assert (exact != exact.astype(np.float64)).mean() > 0.9
 
 
-def test_a_step_s_cells_are_its_own_and_have_no_front_on_a_busy_machine(small_run, monkeypatch):
+def test_a_step_s_cells_are_its_own_and_have_no_front_on_a_busy_machine(small_run):
     """The study is as busy as its busiest step."""
     trial = Trial("a method", 0.5, 2.0, list, True, False, {"max_px_fit": 0.25})
     trial = replace(trial, time_ms=3.0, quartiles_ms=(2.0, 7.0), on_front=True, beaten="why")
@@ -264,11 +247,8 @@ def test_a_step_s_cells_are_its_own_and_have_no_front_on_a_busy_machine(small_ru
         "max_px_fit": 0.25,
     }
     loads = {"first": Load(), "busy": Load(1e3), "last": Load(1e-3)}
-    steps = {name: replace(step, name=name, load=load) for name, load in loads.items()}
-    plans = [lambda stack, quick, name=name: steps[name] for name in loads]
-    monkeypatch.setattr(tradeoff, "STEPS", tuple(plans))
-    monkeypatch.setattr(tradeoff, "measured", lambda step, budget_s: step)
-    run = small_run(tradeoff.run, True)
+    steps = [replace(step, name=name, load=load) for name, load in loads.items()]
+    run = small_run(tradeoff.report, steps)
     fronts = {row["step"]: row["front"] for row in run.rows("tradeoff")}
     assert fronts == {"first": "True", "busy": "", "last": "True"}
     lines, right = run.told
@@ -444,6 +424,7 @@ def test_the_defaults_keep_their_modules_promises(tradeoff_study):
 
 
 def test_less_is_worse(tradeoff_study):
+    """Of steps that draw at chance; the others' errors are those recorded."""
     steps = tradeoff_study[2]
 
     def falls(step, *methods):
@@ -453,26 +434,6 @@ def test_less_is_worse(tradeoff_study):
             errors,
         )
 
-    falls(
-        "psf",
-        "GL polynomial, R32F, 6 px",
-        "GL polynomial, R32F, 8 px",
-        "GL polynomial, R32F, 10 px",
-    )
-    falls(
-        "psf", "GL polynomial, R16F, 10 px", "GL table of 512, 10 px", "GL polynomial, R32F, 10 px"
-    )
-    falls(
-        "brightness",
-        "AGS",
-        "trapezoid, 10 nm",
-        "trapezoid, 5 nm",
-        "trapezoid, 1 nm",
-        "Gauss-Legendre, 3 per knot",
-    )
-    falls("brightness", *(f"table over 1/T, degree {n}" for n in (5, 10, 20, 40)))
-    falls("spectrum", "AGS, one average", "black body, ballesteros2012", "real spectra by V-I")
-    falls("depth", *(f"V to {limit:g}" for limit in LIMITS_V_MAG), "all of Hipparcos")
     falls("culling", "cells of 10 deg, by centres only", "cells of 10 deg")
     falls(
         "projection",
@@ -488,13 +449,6 @@ def test_less_is_worse(tradeoff_study):
         "C2 blend, a sample later",
     )
     falls("smear", *(f"evenly in time, {n}" for n in (4, 8, 16, 32, 64)), "Gauss-Legendre, 24")
-    falls("quantisation", "round", "exact", "exact, bit stealing")
-
-
-def test_the_front_is_what_nothing_beats():
-    errors, times = [3.0, 2.0, 2.0, 1.0, 5.0], [1.0, 2.0, 3.0, 9.0, 1.0]
-    assert pareto_front(errors, times).tolist() == [True, True, False, True, False]
-    assert pareto_front([1.0, 1.0], [2.0, 2.0]).tolist() == [True, True]
 
 
 @pytest.fixture
@@ -539,9 +493,7 @@ def test_a_planted_worse_method_is_off_the_front_and_a_beaten_default_says_why(c
     assert any(beaten.default.beaten in line for line in table_lines(beaten))
 
 
-def test_what_beats_a_default_is_the_fastest_that_does_and_on_a_busy_machine_nothing(
-    clock, monkeypatch
-):
+def test_what_beats_a_default_is_the_fastest_that_does_and_on_a_busy_machine_nothing(clock):
     step = three_methods(clock, 4.0, floor=1.0)
     step = replace(step, trials=[*step.trials, Trial("rough", 0.2, 0.0, clock(2.0))])
     beaten = measured(step, 0.02)
@@ -552,8 +504,7 @@ def test_what_beats_a_default_is_the_fastest_that_does_and_on_a_busy_machine_not
         "slow and rough",
     ]
     assert beaten.default.beaten.startswith("'fast and rough' is no worse")
-    monkeypatch.setattr(sweep.OtherWork, "load", lambda self: Load(1e3))
-    busy = measured(step, 0.02)
+    busy = judged(replace(beaten, load=Load(1e3)))
     assert not any(trial.on_front or trial.beaten for trial in busy.trials)
     assert f"   {sweep.NOT_JUDGED}" in table_lines(busy)
 
@@ -754,14 +705,11 @@ def test_a_rule_reaches_over_all_that_curves_share():
 
 
 def test_sprites_of_a_path_stand_about_its_middle_and_share_its_light():
-    drawn = []
-    bench = SimpleNamespace(chain=lambda at, share, stars: drawn.append((at, share)))
-    methods = smear_methods(bench)
-    for method in methods.values():
-        method(None)
-    counts = [len(at) for at, _ in drawn]
+    placed = places.path_nodes()
+    assert list(placed) == list(places.smear_methods(places.smear_bench()))
+    counts = [len(at) for at, _ in placed.values()]
     assert sorted(counts) == sorted((*GAUSS, EXACT_NODES, *EVENLY))
-    for at, share in drawn:
+    for at, share in placed.values():
         assert share.sum() == pytest.approx(1.0)
         assert share @ at == pytest.approx(0.0, abs=1e-12)
         # of a path from -1/2 to 1/2, all but what so many sprites leave out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ from hilstar.instruments.confront.photographed_sky import DatedSky
 from hilstar.instruments.confront.photon_transfer import PixelFit
 from hilstar.instruments.confront.report import Confronted
 from hilstar.instruments.confront.session import Session, Shot
-from hilstar.instruments.confront.star_psf import StarPsf
+from hilstar.instruments.confront.star_psf import Measured, StarPsf
 from hilstar.optics.camera import Camera, Lens
 from hilstar.server.bench.bench_file import BenchFile, bench_file_of
 from hilstar.sky.catalog import plain_catalog
@@ -109,6 +110,25 @@ def a_shot(number: int) -> Shot:
         matched=SolvedField(q_icrs_to_cam, 4000.0, first, first),
         star=np.empty(0, dtype=np.intp),
     )
+
+
+def sources_at(places_px: Sequence[tuple[float, float]], **changes: float) -> FoundSources:
+    """Sources of a signal of 9 sigmas, 2 px long and wide, at places."""
+    x_px, y_px = np.array(places_px, dtype=float).reshape(-1, 2).T
+    figures = {"snr": 9.0, "length_px": 2.0, "width_px": 2.0, "fwhm_px": 2.0} | changes
+    columns = {name: np.full(len(x_px), figure) for name, figure in figures.items()}
+    return FoundSources(x_px, y_px, single=np.zeros(len(x_px), dtype=bool), **columns)
+
+
+def seen_shot(places_px: Sequence[tuple[float, float]], star: list[int], **changes: Any) -> Shot:
+    """A photograph of stars, rows of its sky, that are seen at places, alone and by 1 px and 1
+    DN.
+    """
+    x_px, y_px = np.array(places_px, dtype=float).T
+    one, no = np.ones(len(star)), np.zeros(len(star), dtype=bool)
+    found = Measured(x_px, y_px, one, one.copy(), one, one)
+    whole = replace(a_shot(0), star=np.array(star), measured=found, saturated=no, blended=no)
+    return replace(whole, **changes)
 
 
 def a_light() -> LightFit:

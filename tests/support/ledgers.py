@@ -5,14 +5,11 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import msgspec
 from mcap.reader import make_reader
 
 from hilstar.attitude.logs.mcap_log import read_messages
-from hilstar.server.bench.config.attitude import AttitudeSettings
 from hilstar.server.record.ledger_records import (
     EventRecord,
     FrameRecord,
@@ -61,26 +58,3 @@ def messages_by_topic(path: Path) -> dict[str, list[dict]]:
         for _, channel, message in make_reader(file).iter_messages():
             found.setdefault(channel.topic, []).append(json.loads(message.data))
     return found
-
-
-def kept_bench(path: Path) -> Any:
-    """What a ledger asks of a bench, of a file; nothing is opened."""
-    settings = SimpleNamespace(
-        render=SimpleNamespace(codes_ms=None),
-        attitude=AttitudeSettings(),
-        tracker=SimpleNamespace(q_body_to_cam=None),
-        certify=SimpleNamespace(certificate=None),
-    )
-    renderer = SimpleNamespace(
-        gl_renderer="none",
-        gl_version="none",
-        path="NumPy",
-        target=SimpleNamespace(quantisation="exact"),
-    )
-    return SimpleNamespace(
-        file=SimpleNamespace(path=path, text=path.read_text(), sha256="0" * 64, config=settings),
-        calibration=SimpleNamespace(name="srgb", sha256="1" * 64),
-        output={},
-        renderer=renderer,
-        config=settings,
-    )

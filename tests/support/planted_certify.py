@@ -19,8 +19,9 @@ import pytest
 from hilstar.instruments.calibrate.first_light.image_sources import VirtualBench
 from hilstar.instruments.certify import assembly, certificate, structure
 from hilstar.instruments.certify.budget import BATCH
+from hilstar.instruments.certify.model import ReferenceStar
 from hilstar.instruments.certify.readings import ImageReader
-from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.bench_file import BenchFile, bench_file_of, read_bench_file
 from tests.support.planted_readings import (
     ARCSEC,
     DELAY_MS,
@@ -63,6 +64,32 @@ focal_length_mm = 350
 flux_at_white_e_per_s = {white}
 sprite_sigma_px = [0.85, 0.85]
 """
+
+
+def stated_bench(keys: str = "") -> BenchFile:
+    """The bench with these lines added, as it is read: of an sRGB monitor and a plain lens."""
+    text = BENCH.format(calibration="srgb", delay_ms=DELAY_MS, geometry="", white=WHITE_E_PER_S)
+    return bench_file_of(Path("bench.toml"), f"{text}{keys}")
+
+
+def reference_star(**changes: Any) -> ReferenceStar:
+    """A star of the first field's left third, of one level of full light in one pixel."""
+    whole = ReferenceStar(
+        hip=1,
+        row=0,
+        v_mag=5.0,
+        b_v_mag=0.5,
+        field=0,
+        third=0,
+        x_px=100.0,
+        y_px=100.0,
+        direction=np.array([0.0, 0.0, 1.0]),
+        quantised_mag=0.0,
+        log_light=np.zeros(1),
+        share=np.ones(1),
+        pixel_px=np.zeros((1, 2), dtype=np.intp),
+    )
+    return replace(whole, **changes)
 
 
 @dataclass(frozen=True)

@@ -25,3 +25,11 @@ def write_readings(
     """Write them to a file; its path."""
     path.write_text(readings_text(rows, header))
     return path
+
+
+def csv_numbers(path: Path) -> list[dict[str, float]]:
+    """The rows of a table of numbers."""
+    rows = []
+    for row in csv_rows(path):
+        rows.append({name: float(text) for name, text in row.items()})
+    return rows

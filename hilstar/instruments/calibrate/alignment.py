@@ -419,13 +419,12 @@ def summary_of(found: Aligned) -> dict[str, Any]:
         "repeat_arcsec": repeat,
         "unexplained_arcsec": unexplained,
         "q_cam_to_mon": found.q_cam_to_mon.tolist(),
-        "notes": remarks_of(found),
+        "notes": remarks_of(found.residual),
     }
 
 
-def remarks_of(found: Aligned) -> tuple[str, ...]:
-    """What the figures alone do not say."""
-    residual = found.residual
+def remarks_of(residual: Residual) -> tuple[str, ...]:
+    """What the figures of an alignment that leaves this alone do not say."""
     remarks = []
     unexplained = residual.unexplained
     if residual.attitudes == 1:
@@ -478,7 +477,7 @@ def lines_of(found: Aligned) -> list[str]:
         ]
     width = max(len(name) for name, _ in rows) + 2
     lines = [f"{name:{width}}{text}" for name, text in rows]
-    return [*lines, *remarks_of(found)]
+    return [*lines, *remarks_of(found.residual)]
 
 
 def _both(axes: AxesArcsec) -> str:

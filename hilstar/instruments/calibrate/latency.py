@@ -5,6 +5,7 @@ caused them.
 import math
 import re
 from array import array
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -65,10 +66,15 @@ def capture_edges(port: str, baud: int, seconds: float) -> Edges:
     Device times are converted to the host's clock by the lower hull of their delays, so the minimum
     delay stays in the latency. Raises InputError where there are too few.
     """
+    return edges_in(read_lines(port, baud, seconds), f"serial:{port}@{baud}")
+
+
+def edges_in(lines: Iterable[tuple[int, bytes]], source: str) -> Edges:
+    """The edges among a device's lines and their times, host ns (see `capture_edges`)."""
     host: list[int] = []
     levels: list[int] = []
     device_us: list[int] = []
-    for line_ns, line in read_lines(port, baud, seconds):
+    for line_ns, line in lines:
         match = DEVICE_LINE.fullmatch(line)
         if match is None:
             continue
@@ -78,8 +84,7 @@ def capture_edges(port: str, baud: int, seconds: float) -> Edges:
             device_us.append(int(match[2]))
     if len(host) < MIN_EDGES:
         raise InputError(
-            f"serial:{port}@{baud}: {len(host)} edges came, and at least {MIN_EDGES} are needed;"
-            f" {DEVICE_FORM}"
+            f"{source}: {len(host)} edges came, and at least {MIN_EDGES} are needed; {DEVICE_FORM}"
         )
     host_ns = np.array(host, dtype=np.int64)
     if len(device_us) == len(host):

@@ -49,6 +49,26 @@ LEDGER_COLUMNS = (
     *("error_x_arcsec", "error_y_arcsec", "error_z_arcsec"),
 )
 RunCases = Callable[[Campaign, Directory, str], None]
+TimeCases = Callable[[Campaign], tuple[float, float]]
+
+
+def first_cases_s(campaign: Campaign) -> tuple[float, float]:
+    """The time of a case, s: the mean of the first TIMED_CASES, after one that warms up; and how
+    much longer that one took, with its session.
+    """
+    count = min(TIMED_CASES, campaign.cases)
+    points = campaign.design.points(0, count)
+    opened_s = time.perf_counter()
+    session = Session(campaign.job)
+    try:
+        session.row(0, points[0])
+        begun_s = time.perf_counter()
+        for number, point in enumerate(points):
+            session.row(number, point)
+        case_s = (time.perf_counter() - begun_s) / count
+    finally:
+        session.close()
+    return case_s, max(begun_s - opened_s - case_s, 0.0)
 
 
 class Acceptance(AcceptedBench):
@@ -88,9 +108,9 @@ class Acceptance(AcceptedBench):
         )
         return case_set
 
-    def costs(self, workers: int) -> Iterator[CostOfSet]:
-        """How long each set takes, by the time of its first cases and of a campaign's set-up; on a
-        bench, by its timeout at most. The page comes on top.
+    def costs(self, workers: int, timed: TimeCases = first_cases_s) -> Iterator[CostOfSet]:
+        """How long each set takes, by the time of its first cases, as they are `timed`, and of a
+        campaign's set-up; on a bench, by its timeout at most. The page comes on top.
         """
         for case_set in self.sets:
             if case_set.refused:
@@ -115,7 +135,7 @@ class Acceptance(AcceptedBench):
             if self.on_bench:
                 yield CostOfSet(case_set, cases, cases * campaigns[0].plan.limit_s)
                 continue
-            times_s = np.array([_case_s(campaign) for campaign in campaigns])
+            times_s = np.array([timed(campaign) for campaign in campaigns])
             case_s, warm_up_s = times_s.mean(axis=0).tolist()
             level_s = of_level * case_s / min(workers, of_level) + warm_up_s + set_up_s
             seconds = run * level_s
@@ -248,25 +268,6 @@ def _unit(clause: ClauseTable, case_set: CaseSet) -> str:
     if clause.quantity == "edge" and case_set.sweep is not None:
         return case_set.sweep.unit
     return clause.require.unit
-
-
-def _case_s(campaign: Campaign) -> tuple[float, float]:
-    """The time of a case, s: the mean of the first TIMED_CASES, after one that warms up; and how
-    much longer that one took, with its session.
-    """
-    count = min(TIMED_CASES, campaign.cases)
-    points = campaign.design.points(0, count)
-    opened_s = time.perf_counter()
-    session = Session(campaign.job)
-    try:
-        session.row(0, points[0])
-        begun_s = time.perf_counter()
-        for number, point in enumerate(points):
-            session.row(number, point)
-        case_s = (time.perf_counter() - begun_s) / count
-    finally:
-        session.close()
-    return case_s, max(begun_s - opened_s - case_s, 0.0)
 
 
 def write_ledger(path: Path, results: list[SetResult]) -> int:

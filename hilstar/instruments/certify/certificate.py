@@ -27,7 +27,7 @@ from hilstar.instruments.certify.budget import (
     why_they_differ,
 )
 from hilstar.instruments.certify.check import take_check
-from hilstar.instruments.certify.model import THIRDS, true_deviations
+from hilstar.instruments.certify.model import THIRDS, ReferenceStar, true_deviations
 from hilstar.instruments.certify.readings import Reader
 from hilstar.server.bench.alignment import cube_to_boresight
 from hilstar.server.bench.bench_file import BenchFile
@@ -210,7 +210,7 @@ def _figures(
     for number, (quantity, which, unit) in enumerate(budget.names):
         if quantity in missing:
             continue
-        star, field, region = _place_of(budget, quantity, which)
+        star, field, region = _place_of(budget.figures.stars, quantity, which)
         standard = float(combined.standard[number])
         why = why_they_differ(combined, drawn, budget.inputs, number)
         interval: Combined | BudgetTrials = combined
@@ -254,14 +254,16 @@ def _figures(
         )
 
 
-def _place_of(budget: Assembled, quantity: str, which: int) -> tuple[int | None, int | None, str]:
+def _place_of(
+    stars: list[ReferenceStar], quantity: str, which: int
+) -> tuple[int | None, int | None, str]:
     """The star (HIP), the field and the region of a figure."""
     if quantity == "latency":
         return None, None, "screen"
     if quantity.startswith("attitude"):
         field = -1 - which
         return None, field, f"field {field}"
-    star = budget.figures.stars[which]
+    star = stars[which]
     return star.hip, star.field, THIRDS[star.third]
 
 

@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from hilstar.basics.arrays import BoolArray, FloatArray, IntArray
@@ -101,7 +102,9 @@ def _of_field(
     x = rows["x_px"].astype(np.float64)
     y = rows["y_px"].astype(np.float64)
     third = thirds(geometry, x)
-    usable = np.flatnonzero(_usable(bench, frame, geometry))
+    width_px = max(bench.psf.width_px)
+    of_catalogue = bench.stars.row[frame.star] >= 0
+    usable = np.flatnonzero(usable_stars(rows, of_catalogue, width_px, geometry))
     shown = shown_light(frame.levels, bench.panel)
     vectors = bench.stars.directions(frame.star) @ to_matrix(frame.q_icrs_to_cam).T
     stars = []
@@ -112,7 +115,7 @@ def _of_field(
         steps = np.linspace(0, len(members) - 1, STARS_A_THIRD)
         picked = np.unique(steps.astype(np.intp))
         for k in members[picked]:
-            pixel_px = _window(bench, x[k], y[k])
+            pixel_px = _window(width_px, x[k], y[k])
             at = pixel_px[:, 0], pixel_px[:, 1]
             light = shown[at]
             wanted = float(frame.linear[at].sum(dtype=np.float64))
@@ -140,33 +143,34 @@ def _of_field(
     return stars
 
 
-def _usable(bench: Bench, frame: Frame, geometry: BenchGeometry) -> BoolArray:
+def usable_stars(
+    rows: npt.NDArray[np.void], of_catalogue: BoolArray, width_px: float, geometry: BenchGeometry
+) -> BoolArray:
     """Whether each row of a frame (n,) is a star that stands alone, is wholly on the monitor, and
-    is seen by the tracker.
+    is seen by the tracker; the sigma of the PSF is `width_px` along its longer axis.
     """
-    rows = frame.rows
     x = rows["x_px"].astype(np.float64)
     y = rows["y_px"].astype(np.float64)
     places = np.nan_to_num(np.stack([x, y], axis=1), nan=-1e6)
-    radius_px = ALONE_SIGMAS * max(bench.psf.width_px)
+    radius_px = ALONE_SIGMAS * width_px
     near = cKDTree(places).query_ball_point(places, radius_px, return_length=True)
     usable = rows["drawn"] & ~rows["clipped"] & (near == 1)
-    usable &= bench.stars.row[frame.star] >= 0
+    usable &= of_catalogue
     usable &= _seen(geometry, x, y)
-    edge_px = _reach(bench) + 1
-    for at, size in zip((x, y), bench.camera.resolution_px, strict=True):
+    edge_px = _reach(width_px) + 1
+    for at, size in zip((x, y), geometry.monitor.resolution_px, strict=True):
         usable &= (at > edge_px) & (at < size - 1 - edge_px)
     return np.asarray(usable)
 
 
-def _reach(bench: Bench) -> int:
+def _reach(width_px: float) -> int:
     """How many pixels a star has to each side of its middle."""
-    return math.ceil(REACH_SIGMAS * max(bench.psf.width_px))
+    return math.ceil(REACH_SIGMAS * width_px)
 
 
-def _window(bench: Bench, x_px: float, y_px: float) -> IntArray:
+def _window(width_px: float, x_px: float, y_px: float) -> IntArray:
     """The rows and columns (n, 2) of a star's pixels about a place on the monitor."""
-    reach = _reach(bench)
+    reach = _reach(width_px)
     about = np.arange(-reach, reach + 1, dtype=np.intp)
     row, column = np.meshgrid(round(y_px) + about, round(x_px) + about, indexing="ij")
     return np.stack([row.ravel(), column.ravel()], axis=1)

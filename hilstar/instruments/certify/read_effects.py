@@ -192,7 +192,7 @@ def _of_structure(figures: Figures, read: Read, place: Places) -> Iterator[Effec
     if read.light.beside is not None:
         yield from _of_neighbours(read.light.beside, len(figures.stars))
     if read.even.structure.total:
-        yield _of_uneven_light(figures, read)
+        yield _of_uneven_light(figures, read.even, read.light.square_px)
     if place.structure.total:
         error = math.sqrt(place.structure.total)
         length = place.structure.mean_length
@@ -245,18 +245,18 @@ def _of_neighbours(beside: BesideRatio, count: int) -> Iterator[Effect]:
     yield Effect(pixels, even=of_all_stars(count, excess))
 
 
-def _of_uneven_light(figures: Figures, read: Read) -> Effect:
+def _of_uneven_light(figures: Figures, even: Evenness, square_px: tuple[int, int, int]) -> Effect:
     """The effect of the light that a map leaves, at each star's place and in the square where light
     was read.
     """
-    structure = read.even.structure
+    structure = even.structure
     count = len(figures.stars)
-    x, y = _places_in(read.light.square_px)
+    x, y = _places_in(square_px)
     of_square = np.full((count, len(x)), -1 / len(x))
     shares = np.concatenate([np.eye(count), of_square], axis=1)
     x = np.append(figures.x_px, x)
     y = np.append(figures.y_px, y)
-    scatter = read.even.scatter(x, y, shares)
+    scatter = even.scatter(x, y, shares)
     error = math.sqrt(structure.total)
     length = structure.mean_length
     source = (

@@ -18,10 +18,12 @@ from hilstar.basics.rotation import to_matrix
 from hilstar.basics.units import MAD_TO_SIGMA as MAD
 from hilstar.basics.units import flux_ratio
 from hilstar.instruments.confront.background import EIGHT_NEIGHBOURS, source_mask
+from hilstar.instruments.confront.camera_fit import CameraFit, Pointing
 from hilstar.instruments.confront.light import BRIGHT_V_MAG
 from hilstar.instruments.confront.photographed_sky import planets_seen
 from hilstar.instruments.confront.session import MATCH_PX, Session, Shot, within_image
 from hilstar.instruments.simulate.simulator import Simulator
+from hilstar.optics.camera import Camera
 from hilstar.optics.layers.view import STILL
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.star_light import bench_moving
@@ -210,7 +212,7 @@ class Judge:
             config.tracker.exposure_s, config.tracker.detector.gain_e_per_dn
         )
         above_sigmas = (self._above_sigmas(shot) for shot in session.shots)
-        self.hot, self.dead = defects(above_sigmas, self._moved_px() >= MOVED_PX)
+        self.hot, self.dead = defects(above_sigmas, boresights_moved_px(session.camera) >= MOVED_PX)
 
     def close(self) -> None:
         """Free the simulator's context."""
@@ -220,16 +222,6 @@ class Judge:
         """A photograph above its background, in sigmas of its pixels' noise."""
         noise_dn = np.sqrt(self.session.pixels.variance_dn2(shot.level.level))
         return np.asarray(shot.above_dn / noise_dn)
-
-    def _moved_px(self) -> float:
-        """How far apart boresights of the photographs are along an axis of the sky, px."""
-        camera = self.session.camera
-        boresights = []
-        for pointing in camera.pointings:
-            icrs_to_cam = to_matrix(pointing.q_icrs_to_cam)
-            boresights.append(icrs_to_cam[2])
-        spread = np.ptp(np.array(boresights), axis=0)
-        return float(spread.max() * camera.camera.focal_length_px)
 
     def of(self, number: int) -> Verdict:
         """The verdict on a photograph."""
@@ -246,7 +238,8 @@ class Judge:
         rows = flagged_dim(rows, is_dim)
         light_sigma = light_dn / np.sqrt(variance)
         sources = self._sources(number, light_sigma, expected)
-        background_chi2 = chi2_of(residual[self._background(shot, light_sigma)])
+        background = background_of(shot, light_sigma, self.hot, self.dead)
+        background_chi2 = chi2_of(residual[background])
         star_chi2 = math.nan
         if shot.clean.any():
             star_chi2 = float(np.median(shot.found.chi2[shot.clean]))
@@ -266,7 +259,7 @@ class Judge:
             background_chi2=background_chi2,
             star_chi2=star_chi2,
             dim=dim,
-            dated=self._dated(number),
+            dated=dated_by(shot, session.camera.pointings[number], session.camera),
             fainter=self._fainter(number, expected),
             expected=expected,
             predicted=level + light_dn,
@@ -327,31 +320,10 @@ class Judge:
             if star in place:
                 figures = (stars.x_px[k], stars.y_px[k], stars.dn[k], stars.sigma_dn[k])
                 rows.append(_star_row(shot, expected, place[star], figures, flags[k]))
-        for star in self._missing(shot, expected):
+        for star in missing_stars(shot, expected, self._pixel_variance(shot)):
             figures = (math.nan,) * 4
             rows.append(_star_row(shot, expected, place[star], figures, ("missing",)))
         return rows
-
-    def _missing(self, shot: Shot, expected: Expected) -> Iterator[int]:
-        """Stars, rows of the sky, that should stand out of the noise, and where no light is."""
-        place = _places_by_star(expected)
-        identified = set(shot.star.tolist())
-        near_saturated = _saturated(shot)
-        source_tree = cKDTree(shot.sources.places_px)
-        in_middle = within_image(expected.x_px, expected.y_px, shot.photo.size_px, 2 * MATCH_PX)
-        noise_dn = math.sqrt(self._pixel_variance(shot) * NEFF_PX)
-        above_dn = shot.above_dn
-        for star in expected.star[expected.dn > EXPECTED_SNR * noise_dn].tolist():
-            k = place[star]
-            x = expected.x_px[k]
-            y = expected.y_px[k]
-            if star in identified or not in_middle[k] or near_saturated(x, y):
-                continue
-            if source_tree.query([x, y])[0] <= 2 * MATCH_PX:
-                continue
-            # its light may be part of a larger source
-            if light_at(above_dn, x, y) < expected.dn[k] / 2:
-                yield star
 
     def _pixel_variance(self, shot: Shot) -> float:
         """The variance of a background pixel, DN^2."""
@@ -368,38 +340,24 @@ class Judge:
         if sources.trail.any():
             satellites = self._satellites(number)
         hot = ndimage.binary_dilation(self.hot, EIGHT_NEIGHBOURS)
+        camera = self.session.camera
         explanation = _Explanation(
             shot=shot,
             expected=expected,
             tree=_tree_of(expected),
-            planets=self._planets(number),
+            planets=planets_on(shot.photo.t_ns, camera.pointings[number], camera.camera),
             satellites=satellites,
             near_saturated=_saturated(shot),
             hot=hot,
             light_sigma=light_sigma,
             pixel_dn=math.sqrt(self._pixel_variance(shot)),
-            focal_length_px=self.session.camera.camera.focal_length_px,
+            focal_length_px=camera.camera.focal_length_px,
         )
         rows = []
         for k in range(len(sources)):
             x_px, y_px = sources.places_px[k].tolist()
             rows.append(SourceRow(x_px, y_px, float(sources.snr[k]), explanation.of(k)))
         return rows
-
-    def _planets(self, number: int) -> dict[str, tuple[float, float]]:
-        """Places of planets by name, px, those beyond the image, too; none without a date."""
-        shot = self.session.shots[number]
-        if shot.photo.t_ns is None:
-            return {}
-        planets = planets_seen(shot.photo.t_ns)
-        camera = self.session.camera
-        vectors = np.array(list(planets.values()))
-        x, y = camera.pointings[number].places_px(camera.camera, vectors)
-        places = {}
-        for name, x_px, y_px in zip(planets, x.tolist(), y.tolist(), strict=True):
-            if math.isfinite(x_px) and math.isfinite(y_px):
-                places[name] = (x_px, y_px)
-        return places
 
     def _satellites(self, number: int) -> dict[str, tuple[float, float]]:
         """Places of satellites in the middle of the exposure, by the bench's list; none without
@@ -431,20 +389,13 @@ class Judge:
             places[moving.satellites.names[k]] = (x_px, y_px)
         return places
 
-    def _background(self, shot: Shot, light_sigma: FloatArray) -> BoolArray:
-        """Pixels without light of stars and sources."""
-        lit = np.abs(light_sigma) > LIT_SIGMA
-        lit |= source_mask(shot.sources, shot.level.above(shot.photo.dn), MASK_PX)
-        return np.asarray(~(lit | self.hot | self.dead))
-
     def _fainter(self, number: int, expected: Expected) -> Fainter:
         """How many sources are stars beyond Hipparcos, by its own stars in the image and the
         slope of star counts.
         """
         shot = self.session.shots[number]
         pointing = self.session.camera.pointings[number]
-        galactic_sine = abs(float(pointing.boresight @ GALACTIC_POLE))
-        complete_mag = COMPLETE_V_MAG[0] + COMPLETE_V_MAG[1] * galactic_sine
+        complete_mag = complete_v_mag(pointing.boresight)
         if not shot.clean.any():
             return Fainter(complete_mag, math.nan, 0.0)
         clean_places_px = shot.found.places_px[shot.clean]
@@ -455,37 +406,99 @@ class Judge:
         if reached_mag <= complete_mag:
             return Fainter(complete_mag, reached_mag, 0.0)
         v_mag = shot.sky.v_mag[expected.star]
-        slope = COUNTS_SLOPE[0] + COUNTS_SLOPE[1] * galactic_sine
+        slope = COUNTS_SLOPE[0] + COUNTS_SLOPE[1] * galactic_sine(pointing.boresight)
         expected_stars = stars_beyond(v_mag, complete_mag, reached_mag, slope)
         return Fainter(complete_mag, reached_mag, expected_stars)
 
-    def _dated(self, number: int) -> DatedBy | None:
-        """How far off the date is by the stars that move fastest over the image; None without
-        stars.
-        """
-        session = self.session
-        shot = session.shots[number]
-        clean = np.flatnonzero(shot.clean)
-        if not len(clean):
-            return None
-        star = shot.star[clean]
-        catalog = shot.sky.catalog.taken(shot.sky.order[star])
-        epoch_jyear = shot.sky.epoch_jyear
-        now = unit_vectors_icrs(catalog, epoch_jyear)
-        next_year = unit_vectors_icrs(catalog, epoch_jyear + 1)
-        vectors = shot.sky.vectors[star]
-        moved = vectors + (next_year - now)
-        pointing = session.camera.pointings[number]
-        camera = session.camera.camera
-        now_px = np.column_stack(pointing.places_px(camera, vectors))
-        next_year_px = np.column_stack(pointing.places_px(camera, moved))
-        off_px = shot.found.places_px[clean] - now_px
-        floor_px = max(session.camera.floor_px, 0.02)
-        sigma_px = np.hypot(shot.found.sigma_px[clean], floor_px)[:, None]
-        motion = (next_year_px - now_px) / sigma_px
-        information = max(float((motion**2).sum()), 1e-12)
-        years = float((motion * off_px / sigma_px).sum()) / information
-        return DatedBy(years, information**-0.5)
+
+def galactic_sine(direction: FloatArray) -> float:
+    """The size of the sine of a direction's galactic latitude; direction (3,), ICRS, unit."""
+    return abs(float(direction @ GALACTIC_POLE))
+
+
+def complete_v_mag(direction: FloatArray) -> float:
+    """V to which Hipparcos is complete about a direction (3,), ICRS, unit."""
+    return COMPLETE_V_MAG[0] + COMPLETE_V_MAG[1] * galactic_sine(direction)
+
+
+def boresights_moved_px(camera: CameraFit) -> float:
+    """How far apart boresights of a camera's photographs are along an axis of the sky, px."""
+    boresights = np.array([pointing.boresight for pointing in camera.pointings])
+    spread = np.ptp(boresights, axis=0)
+    return float(spread.max() * camera.camera.focal_length_px)
+
+
+def planets_on(
+    t_ns: int | None, pointing: Pointing, camera: Camera
+) -> dict[str, tuple[float, float]]:
+    """Places of planets by name, px, at a UTC, those beyond the image, too; none without a date."""
+    if t_ns is None:
+        return {}
+    planets = planets_seen(t_ns)
+    x, y = pointing.places_px(camera, np.array(list(planets.values())))
+    places = {}
+    for name, x_px, y_px in zip(planets, x.tolist(), y.tolist(), strict=True):
+        if math.isfinite(x_px) and math.isfinite(y_px):
+            places[name] = (x_px, y_px)
+    return places
+
+
+def missing_stars(shot: Shot, expected: Expected, variance_dn2: float) -> Iterator[int]:
+    """Stars, rows of the sky, that should stand out of the noise of background pixels of a
+    variance, DN^2, and where no light is.
+    """
+    place = _places_by_star(expected)
+    identified = set(shot.star.tolist())
+    near_saturated = _saturated(shot)
+    source_tree = cKDTree(shot.sources.places_px)
+    in_middle = within_image(expected.x_px, expected.y_px, shot.photo.size_px, 2 * MATCH_PX)
+    noise_dn = math.sqrt(variance_dn2 * NEFF_PX)
+    above_dn = shot.above_dn
+    for star in expected.star[expected.dn > EXPECTED_SNR * noise_dn].tolist():
+        k = place[star]
+        x = expected.x_px[k]
+        y = expected.y_px[k]
+        if star in identified or not in_middle[k] or near_saturated(x, y):
+            continue
+        if source_tree.query([x, y])[0] <= 2 * MATCH_PX:
+            continue
+        # its light may be part of a larger source
+        if light_at(above_dn, x, y) < expected.dn[k] / 2:
+            yield star
+
+
+def background_of(
+    shot: Shot, light_sigma: FloatArray, hot: BoolArray, dead: BoolArray
+) -> BoolArray:
+    """Pixels (height, width) without light of stars and sources, and without defects."""
+    lit = np.abs(light_sigma) > LIT_SIGMA
+    lit |= source_mask(shot.sources, shot.level.above(shot.photo.dn), MASK_PX)
+    return np.asarray(~(lit | hot | dead))
+
+
+def dated_by(shot: Shot, pointing: Pointing, camera: CameraFit) -> DatedBy | None:
+    """How far off a photograph's date is by the stars that move fastest over it; None without
+    stars.
+    """
+    clean = np.flatnonzero(shot.clean)
+    if not len(clean):
+        return None
+    star = shot.star[clean]
+    catalog = shot.sky.catalog.taken(shot.sky.order[star])
+    epoch_jyear = shot.sky.epoch_jyear
+    now = unit_vectors_icrs(catalog, epoch_jyear)
+    next_year = unit_vectors_icrs(catalog, epoch_jyear + 1)
+    vectors = shot.sky.vectors[star]
+    moved = vectors + (next_year - now)
+    now_px = np.column_stack(pointing.places_px(camera.camera, vectors))
+    next_year_px = np.column_stack(pointing.places_px(camera.camera, moved))
+    off_px = shot.found.places_px[clean] - now_px
+    floor_px = max(camera.floor_px, 0.02)
+    sigma_px = np.hypot(shot.found.sigma_px[clean], floor_px)[:, None]
+    motion = (next_year_px - now_px) / sigma_px
+    information = max(float((motion**2).sum()), 1e-12)
+    years = float((motion * off_px / sigma_px).sum()) / information
+    return DatedBy(years, information**-0.5)
 
 
 def dn_offset_mag(exposure_s: float, gain_e_per_dn: float) -> float:

@@ -341,20 +341,14 @@ class LiveTracker(Closing):
         smeared.
         """
         psf_px = software_psf_px(self.canvas.psf.width_px, self.config.tracker.detector)
-        across_rad_s = float(np.linalg.norm(self.rate_cam_rad_s()[:2]))
-        streak_px = across_rad_s * self.exposure_s * self.camera.focal_length_px
-        still = streak_px <= STREAK_PX
-        window_px = max(1.0, *psf_px)
-        if not still:
-            # the standard deviation of an even streak along itself
-            window_px = max(window_px, min(streak_px / np.sqrt(12), MAX_WINDOW_PX))
+        focal_px = self.camera.focal_length_px
+        smeared_px = streak_px(self.rate_cam_rad_s(), self.exposure_s, focal_px)
+        settings = smeared_settings(smeared_px, psf_px)
         image = software_image(dn, self.config.tracker.detector)
         background: LocalBackground | None = None
         if self._dark_dn is not None:
             image = image - self._dark_dn
             background = noisiest_background(image)
-        psf_sigma_px = psf_px if still else None
-        settings = CentroidSettings(window_sigma_px=window_px, psf_sigma_px=psf_sigma_px)
         stars = find_stars(image, settings, background)
         good = ~stars.at_edge
         x_px = stars.x_px[good]
@@ -404,6 +398,22 @@ class LiveTracker(Closing):
     def close(self) -> None:
         """Free the GL context."""
         self._optics.close()
+
+
+def streak_px(rate_cam_rad_s: FloatArray, exposure_s: float, focal_length_px: float) -> float:
+    """How far a star about the boresight moves in an exposure at a rate (3,)."""
+    across_rad_s = float(np.linalg.norm(rate_cam_rad_s[:2]))
+    return across_rad_s * exposure_s * focal_length_px
+
+
+def smeared_settings(smeared_px: float, psf_px: tuple[float, float]) -> CentroidSettings:
+    """How stars are found that are smeared so far beside their PSF's sigmas."""
+    window_px = max(1.0, *psf_px)
+    if smeared_px <= STREAK_PX:
+        return CentroidSettings(window_sigma_px=window_px, psf_sigma_px=psf_px)
+    # the standard deviation of an even streak along itself
+    window_px = max(window_px, min(smeared_px / np.sqrt(12), MAX_WINDOW_PX))
+    return CentroidSettings(window_sigma_px=window_px, psf_sigma_px=None)
 
 
 def _levels_of(codes: npt.NDArray[np.unsignedinteger], rgb: npt.NDArray[np.uint16]) -> IntArray:

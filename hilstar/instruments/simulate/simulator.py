@@ -380,6 +380,16 @@ def pieces_of(
     return tuple(pieces)
 
 
+def joined(parts: Sequence[FrameLight]) -> FrameLight:
+    """The light of an exposure's pieces, end to end: each disc once, and capped stars of all."""
+    whole = join_sprites(parts, parts[0].footprint_px)
+    discs: dict[str, None] = {}
+    for part in parts:
+        discs |= dict.fromkeys(part.discs)
+    capped = sum(part.capped for part in parts)
+    return replace(whole, capped=capped, discs=tuple(discs))
+
+
 class FaultyExposure:
     """One exposure with its faults, as `Simulator.expose` draws it, piece by piece."""
 
@@ -434,13 +444,7 @@ class FaultyExposure:
 
     def sprites(self) -> FrameLight:
         """The sprites of the bench's own stars and discs in any of its pieces, end to end."""
-        parts = [_own(sprites) for sprites in self._seen]
-        whole = join_sprites(parts, parts[0].footprint_px)
-        discs: dict[str, None] = {}
-        for part in parts:
-            discs |= dict.fromkeys(part.discs)
-        capped = sum(part.capped for part in parts)
-        return replace(whole, capped=capped, discs=tuple(discs))
+        return joined([_own(sprites) for sprites in self._seen])
 
     def added_truth(self) -> npt.NDArray[np.void]:
         """Rows of TRUTH_DTYPE for what faults added: in electrons per second of the whole
@@ -590,6 +594,13 @@ def _tracker_keys(config: BenchConfig) -> tuple[object, ...]:
     return config.tracker, config.background, config.sky, config.site
 
 
+def gathered(glow: FloatArray, bayer: str | None) -> FloatArray:
+    """The glow (channels, n) that pixels gather: by channel under a mosaic, else all (1, n)."""
+    if bayer is None:
+        return np.asarray(glow.sum(axis=0, keepdims=True))
+    return glow
+
+
 class TrackerBackground:
     """Light between the stars on a bench's detector: what is the same in every view, zodiacal light
     by direction, sky glow.
@@ -651,9 +662,8 @@ class TrackerBackground:
             self._say(float(sun_angles.elongation_deg.min()), beyond=not zodiacal.tabled.all())
             rates = [light.electrons_per_s_sr(sun_angles, zodiacal) for light in self._lights]
         if self._moving is not None and self._moving.air is not None:
-            glow = self._moving.air.glow_at(directions, self._moving.utc_ns(view.t_ns))
-            if self._bayer is None:
-                glow = glow.sum(axis=0, keepdims=True)
+            of_channels = self._moving.air.glow_at(directions, self._moving.utc_ns(view.t_ns))
+            glow = gathered(of_channels, self._bayer)
             if rates:
                 rates = [rate + more for rate, more in zip(rates, glow, strict=True)]
             else:

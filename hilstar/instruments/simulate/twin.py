@@ -34,7 +34,7 @@ from hilstar.optics.sprites import shares_at
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.cameras import ideal_monitor, real_monitor, tracker_camera
-from hilstar.server.bench.config import Verify
+from hilstar.server.bench.config import Tracker, Verify
 from hilstar.server.bench.frame import Bench, Frame
 from hilstar.server.bench.primary_panels import primary_panels
 from hilstar.tracker.detector import Detector
@@ -49,6 +49,15 @@ def free_phase(number: int) -> float:
     many follow one another, they fill the period evenly.
     """
     return number * GOLDEN % 1.0
+
+
+def exposure_phase_s(tracker: Tracker, refresh_hz: float, first_frame: int) -> float:
+    """When the screen begins a frame after the middle of an exposure: of a free tracker each
+    exposure at another moment.
+    """
+    if tracker.trigger != "free":
+        return -tracker.exposure_s / 2
+    return free_phase(first_frame) / refresh_hz
 
 
 def exposure_lights(
@@ -284,7 +293,7 @@ class Twin(Closing):
         view = rolled(self._exposure_at(frame), self.config.tracker)
         if not view.scan.scanout_s or not self.config.tracker.exposure_s:
             return exposure_lights(self.bench, frame, first_frame, panels), 1.0
-        phase_s = self._phase_s(first_frame)
+        phase_s = exposure_phase_s(self.config.tracker, self.config.monitor.refresh_hz, first_frame)
         parts = []
         for optics, panel in zip((self.true_optics, self.sky_optics), panels, strict=False):
             parts.append(rolling_light(self.bench, optics.geometry, panel, view, phase_s))
@@ -308,14 +317,6 @@ class Twin(Closing):
 
     def _exposure_at(self, frame: Frame) -> View:
         return View.exposure(frame.q_icrs_to_cam, STILL, self.config.tracker.exposure_s, frame.t_ns)
-
-    def _phase_s(self, first_frame: int) -> float:
-        """When the screen begins a frame after the middle of an exposure: of a free tracker each
-        exposure at another moment.
-        """
-        if self.config.tracker.trigger != "free":
-            return -self.config.tracker.exposure_s / 2
-        return free_phase(first_frame) / self.config.monitor.refresh_hz
 
     def detected_dn(self, seen: TwinField, rng: np.random.Generator) -> npt.NDArray[Any]:
         """One noisy exposure (h, w), DN, the mean of glow and background subtracted unless all

@@ -7,7 +7,7 @@ judged by frame time and by finite light.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from itertools import product
@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from hilstar.basics.arrays import FloatArray
+from hilstar.basics.arrays import Float32Array, FloatArray
 from hilstar.basics.charts import (
     BLUE,
     MUTED,
@@ -255,10 +255,7 @@ def measure_cost(benches: Mapping[str, Bench], scene: BodyScene, rounds: int) ->
     `benches` holds "nothing", "all" and the scene's own.
     """
     bench = benches[scene.bench]
-    aimed = bench
-    if bench.moving is None or scene.body not in bench.moving.names:
-        aimed = benches["all"]
-    q = attitude(aimed, scene.body, scene.off_deg, scene.t_ns)
+    q = attitude(aiming_bench(benches, scene), scene.body, scene.off_deg, scene.t_ns)
     empty = benches["nothing"]
     without, shown = fastest((empty, bench), q, scene.t_ns, scene.step_ns, rounds)
     view = bench.view(q, None, scene.t_ns)
@@ -277,6 +274,14 @@ def measure_cost(benches: Mapping[str, Bench], scene: BodyScene, rounds: int) ->
     )
 
 
+def aiming_bench(benches: Mapping[str, Bench], scene: BodyScene) -> Bench:
+    """The bench that knows where a scene's body is: the scene's own, or that of all bodies."""
+    bench = benches[scene.bench]
+    if bench.moving is None or scene.body not in bench.moving.names:
+        return benches["all"]
+    return bench
+
+
 def fastest(
     benches: tuple[Bench, Bench], q: FloatArray, t_ns: int, step_ns: int, rounds: int
 ) -> tuple[Spent, Spent]:
@@ -285,16 +290,23 @@ def fastest(
 
     The second bench's clock begins at `t_ns` and goes on by `step_ns` from frame to frame.
     """
-    nothing, bench = benches
+    times = in_turn(frame_works(benches, q, t_ns, step_ns), rounds)
+    return shortest(times["nothing"]), shortest(times["bodies"])
+
+
+def frame_works(
+    benches: tuple[Bench, Bench], q: FloatArray, t_ns: int, step_ns: int
+) -> dict[str, Callable[[int], Levels]]:
+    """The levels of a frame without bodies, and of one with, by the number of its round."""
+    nothing, shown = benches
 
     def without(_: int) -> Levels:
         return nothing.draw(q).levels
 
     def with_bodies(number: int) -> Levels:
-        return bench.draw(q, t_ns=t_ns + number * step_ns).levels
+        return shown.draw(q, t_ns=t_ns + number * step_ns).levels
 
-    times = in_turn({"nothing": without, "bodies": with_bodies}, rounds)
-    return shortest(times["nothing"]), shortest(times["bodies"])
+    return {"nothing": without, "bodies": with_bodies}
 
 
 def shortest(times: Sequence[Spent]) -> Spent:
@@ -522,29 +534,64 @@ def approach(benches: Mapping[str, Bench], body: str, off_deg: float, rounds: in
     drawn = bench.draw(q, t_ns=start_ns)
     levels = drawn.levels.copy()
     light = bench.renderer.linear()
-    white = bench.flux_at_white_e_per_s
-    brightest = max(float(light.max()), 1e-9)
-    over_white = levels[light > white]
-    over_white_mag = 2.5 * math.log10(brightest / white)
-    is_white = over_white == bench.calibration.response.white
-    finite = bool(np.isfinite(light).all())
+    found = against_white(
+        light, levels, bench.flux_at_white_e_per_s, bench.calibration.response.white
+    )
     return Near(
         body=body,
         off_deg=off_deg,
         frame_ms=shown.wall_ms,
         cpu_ms=shown.cpu_ms,
         without_ms=without.wall_ms,
-        over_white_mag=over_white_mag,
-        finite=finite,
-        white_is_white=bool(is_white.all()),
+        over_white_mag=found.over_white_mag,
+        finite=found.finite,
+        white_is_white=found.white_is_white,
         stars=drawn.star_count,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class AgainstWhite:
+    """A frame's light against white; see `Near`."""
+
+    over_white_mag: float
+    finite: bool
+    white_is_white: bool
+
+
+def against_white(
+    light: Float32Array, levels: Levels, white: float, white_level: int
+) -> AgainstWhite:
+    """A frame's light (h, w) and its levels against the light and the level of white."""
+    brightest = max(float(light.max()), 1e-9)
+    over_white = levels[light > white]
+    is_white = over_white == white_level
+    return AgainstWhite(
+        2.5 * math.log10(brightest / white), bool(np.isfinite(light).all()), bool(is_white.all())
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class BodiesMeasured:
+    """The costs of scenes, the frames near bodies and the errors of discs, and the work of others
+    while frames were timed.
+    """
+
+    costs: Sequence[BodyCost]
+    nears: Sequence[Near]
+    sizes: Sequence[Exactness]
+    load: Load
 
 
 def run(directory: Path, quick: bool = False) -> Judged:
     """Write `bodies_cost`, `bodies_size` and `bodies_limits` (PNG and CSV); a line for each
     finding. Raises InputError.
     """
+    return report(directory, measure(quick))
+
+
+def measure(quick: bool) -> BodiesMeasured:
+    """Every scene's cost, every approach to a body, and every disc."""
     names: tuple[str, ...] = tuple(BODIES)
     rounds = ROUNDS
     near_deg = NEAR_DEG
@@ -569,6 +616,12 @@ def run(directory: Path, quick: bool = False) -> Judged:
     sizes = []
     for phase, radius in product(PHASES_DEG, radii_px):
         sizes.append(exactness(radius, phase))
+    return BodiesMeasured(costs, nears, sizes, load)
+
+
+def report(directory: Path, measured: BodiesMeasured) -> Judged:
+    """Write what was measured; a line for each finding. Raises InputError."""
+    costs, nears, sizes, load = measured.costs, measured.nears, measured.sizes, measured.load
     write_rows(directory / "bodies_cost.csv", costs)
     write_rows(directory / "bodies_size.csv", sizes)
     write_rows(directory / "bodies_limits.csv", nears)

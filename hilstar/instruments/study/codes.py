@@ -2,7 +2,7 @@
 over an exposure.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -238,8 +238,8 @@ def frames_panels() -> list[FramesPanel]:
     ]
 
 
-def study_frames(directory: Path, quick: bool) -> str:
-    """Write over_frames.csv and its chart into `directory`; the finding."""
+def measure_frames(quick: bool) -> list[OverFrames]:
+    """The errors over the frames of an exposure, on every panel."""
     phases = 16
     counts: tuple[int, ...] = FRAMES
     if quick:
@@ -248,6 +248,11 @@ def study_frames(directory: Path, quick: bool) -> str:
     rows: list[OverFrames] = []
     for panel in frames_panels():
         rows += over_frames(panel, phases, counts)
+    return rows
+
+
+def report_frames(directory: Path, rows: Sequence[OverFrames]) -> str:
+    """Write over_frames.csv and its chart into `directory`; the finding."""
     write_rows(directory / "over_frames.csv", rows)
     draw(directory / "over_frames", rows)
     errors = []
@@ -312,7 +317,7 @@ def over_frames(
             yield OverFrames(frames_panel.name, mag, steps, method, count, *rms)
 
 
-def draw(path: Path, rows: list[OverFrames]) -> None:
+def draw(path: Path, rows: Sequence[OverFrames]) -> None:
     """The errors over the frames of an exposure, each panel in its colour."""
     names = list(dict.fromkeys(row.panel for row in rows))
     at_aim = {}

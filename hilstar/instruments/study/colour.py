@@ -19,14 +19,14 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from msgspec.structs import replace as replace_keys
 
-from hilstar.basics.arrays import FloatArray
+from hilstar.basics.arrays import BoolArray, FloatArray, IntArray
 from hilstar.basics.charts import BLUE, GREEN, MUTED, ORANGE, write_csv
 from hilstar.basics.errors import InputError
 from hilstar.basics.resources import resource_path
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.basics.units import magnitude
 from hilstar.display.quantise import Quantisation
-from hilstar.display.response import Levels, srgb_response
+from hilstar.display.response import Codes, Levels, srgb_response
 from hilstar.instruments.simulate.budget import RED_NM, SOLAR_BV
 from hilstar.instruments.study.engine import (
     ChartSpec,
@@ -47,7 +47,8 @@ from hilstar.instruments.study.study_benches import (
 )
 from hilstar.instruments.study.sweep import Judged, Load, OtherWork, in_turn
 from hilstar.optics.glass.glass_psf import NodeSpline
-from hilstar.optics.psf import GaussianPsf, Psf
+from hilstar.optics.psf import GaussianPsf
+from hilstar.optics.sprites import FrameLight
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
 from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.cameras import tracker_psf
@@ -217,6 +218,17 @@ class GamutStars:
     condition: float
     out_share: float
     off_percent_k: float
+
+
+@dataclass(frozen=True, slots=True)
+class LoneLight:
+    """Lone stars (n,) of a frame: their numbers, their light by primary (n, 3), and the errors of
+    their places (n, 2), px.
+    """
+
+    numbers: IntArray
+    by_primary: FloatArray
+    off_px: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -391,10 +403,11 @@ def class_rows(panel: str, sensor: str, stars: GamutStars) -> list[GamutClass]:
     return rows
 
 
-def light_by_primary(bench: Bench, levels: Levels) -> FloatArray:
-    """A frame's light by primary (h, w, 3), relative to each one's white."""
-    light = srgb_response(bench.config.monitor.bits).light
-    rgb = bench.calibration.response.rgb
+def light_by_primary(levels: Levels, bits: int, rgb: Codes | None) -> FloatArray:
+    """A frame's light by primary (h, w, 3), relative to each one's white; `rgb` has the codes of
+    each level where bit stealing makes them.
+    """
+    light = srgb_response(bits).light
     if levels.ndim == 3:
         return light[levels]
     if rgb is None:
@@ -407,6 +420,8 @@ def shown_stars(bench: Bench, colours: Colours, fields: int) -> ShownStars:
     white = colours.of_white * bench.flux_at_white_e_per_s
     stars = bench.shown_stars
     rng = np.random.default_rng(1)
+    bits, rgb = bench.config.monitor.bits, bench.calibration.response.rgb
+    judged = is_judged(stars.v_mag)
     wanted = []
     shares = []
     light = []
@@ -415,26 +430,58 @@ def shown_stars(bench: Bench, colours: Colours, fields: int) -> ShownStars:
         ra_deg = rng.uniform(0, 360)
         dec_deg = math.degrees(math.asin(rng.uniform(-1, 1)))
         q = from_radec_roll_deg(ra_deg, dec_deg, 0.0)
-        images = light_by_primary(bench, bench.draw(q).levels) * white
-        sprites = bench.sprites(q, stars)
-        for number, window in lone_windows(sprites, sprites.x_px, sprites.y_px, FRAME_PX, LONE):
-            by_primary = images[window].sum(axis=(0, 1))
-            is_judged = BRIGHTEST_V_MAG < stars.v_mag[number] < FAINTEST_V_MAG
-            if not (is_judged and by_primary.any()):
-                continue
-            total = by_primary.sum()
-            rate = float(stars.electrons_per_s[number])
-            centroids = []
-            for k in range(3):
-                centroids.append(centroid_px(images[..., k], window))
-            middles = np.nan_to_num(centroids) + colours.places_px
-            row = int(np.flatnonzero(sprites.star == number)[0])
-            true_px = sprites.x_px[row], sprites.y_px[row]
-            wanted.append(colours.wanted(stars, np.array([number]))[0])
-            shares.append(by_primary / (total if colours.mono else rate))
-            light.append(total / rate)
-            off_px.append(by_primary @ middles / total - true_px)
-    return ShownStars(*map(np.array, (wanted, shares, light, off_px)))
+        images = light_by_primary(bench.draw(q).levels, bits, rgb) * white
+        found = lone_light(images, bench.sprites(q, stars), judged, colours.places_px)
+        rates = stars.electrons_per_s[found.numbers]
+        wanted.append(colours.wanted(stars, found.numbers))
+        shares.append(primary_shares(found.by_primary, rates, colours.mono))
+        light.append(found.by_primary.sum(axis=1) / rates)
+        off_px.append(found.off_px)
+    return ShownStars(*map(np.concatenate, (wanted, shares, light, off_px)))
+
+
+def is_judged(v_mag: FloatArray) -> BoolArray:
+    """Whether stars (n,) are fainter than white and bright enough for their colour to be read."""
+    return np.asarray((v_mag > BRIGHTEST_V_MAG) & (v_mag < FAINTEST_V_MAG))
+
+
+def primary_shares(by_primary: FloatArray, rates: FloatArray, mono: bool) -> FloatArray:
+    """The shares of primaries (n, 3) in the light of stars: of all that is shown before a mono
+    sensor, of the wanted rates (n,) before another.
+    """
+    of = by_primary.sum(axis=1) if mono else rates
+    return np.asarray(by_primary / of[:, None])
+
+
+def lone_light(
+    images: FloatArray, sprites: FrameLight, judged: BoolArray, places_px: FloatArray
+) -> LoneLight:
+    """The lone stars that are judged (by the number of a star) and show light, in the images
+    (h, w, 3) of the primaries, which stand at `places_px` (3, 2) within a pixel.
+    """
+    height, width, _ = images.shape
+    numbers = []
+    lights = []
+    off_px = []
+    for number, window in lone_windows(sprites, sprites.x_px, sprites.y_px, (width, height), LONE):
+        by_primary = images[window].sum(axis=(0, 1))
+        if not (judged[number] and by_primary.any()):
+            continue
+        centroids = []
+        for k in range(3):
+            centroids.append(centroid_px(images[..., k], window))
+        middles = np.nan_to_num(centroids) + places_px
+        row = int(np.flatnonzero(sprites.star == number)[0])
+        true_px = sprites.x_px[row], sprites.y_px[row]
+        numbers.append(number)
+        lights.append(by_primary)
+        off_px.append(by_primary @ middles / by_primary.sum() - true_px)
+    count = len(numbers)
+    return LoneLight(
+        np.array(numbers, dtype=np.intp),
+        np.reshape(lights, (count, 3)),
+        np.reshape(off_px, (count, 2)),
+    )
 
 
 def frame_of(bench: Bench, number: int) -> Levels:
@@ -523,10 +570,10 @@ def study_lateral(folder: Path) -> Iterator[LateralColour]:
         white = colours.of_white + 0 * wanted[:, :1]
         shares = {"white": white, "star": colours.shares(wanted)}
         plain_shares = {"white": white, "star": plain.shares(wanted)}
-        sky_px = moved_px(psf, places, true_shares, solar)
+        sky_px = moved_px(psf.centroids_px, places, true_shares, solar)
         linear_sky_px = linear_px(wanted[:, :1], solar)
         for colour, mixture in shares.items():
-            shown_px = moved_px(psf, places, mixture @ by_primary, solar)
+            shown_px = moved_px(psf.centroids_px, places, mixture @ by_primary, solar)
             yield lateral_colour("planar-1897", panel, colour, sky_px, shown_px)
             linear_shown_px = linear_px(plain.shown(plain_shares[colour]), solar)
             yield lateral_colour("linear", panel, colour, linear_sky_px, linear_shown_px)
@@ -551,11 +598,18 @@ def linear_px(mean_nm: FloatArray, against: int) -> FloatArray:
     return np.asarray((mean_nm - mean_nm[against]).T / 100)
 
 
-def moved_px(psf: Psf, places_px: FloatArray, spectra: FloatArray, against: int) -> FloatArray:
-    """The shift of spectra (n, L) at places (2, n), px, against one of them at the same places."""
+def moved_px(
+    centroids_px: Callable[..., tuple[FloatArray, ...]],
+    places_px: FloatArray,
+    spectra: FloatArray,
+    against: int,
+) -> FloatArray:
+    """The shift of spectra (n, L) at places (2, n), px, against one of them at the same places, by
+    the centroids of a PSF.
+    """
     x_px, y_px = places_px
-    moved = np.stack(psf.centroids_px(x_px, y_px, spectra)[:2])
-    reference = np.stack(psf.centroids_px(x_px, y_px, spectra[against])[:2])
+    moved = np.stack(centroids_px(x_px, y_px, spectra)[:2])
+    reference = np.stack(centroids_px(x_px, y_px, spectra[against])[:2])
     return np.asarray(moved - reference)
 
 
@@ -585,8 +639,13 @@ def study_mosaic(channels: Sequence[Optics]) -> Iterator[MosaicPlaces]:
         for name, (image, spread_px) in images.items():
             width_px = math.sqrt(sigma_px**2 + spread_px)
             off_px = mosaic_off_px(image, width_px, steps)
-            rms_px = float(np.sqrt((off_px**2).mean()))
-            yield MosaicPlaces(sigma_px, kelvin, name, rms_px, float(np.abs(off_px).max()))
+            yield mosaic_places(sigma_px, kelvin, name, off_px)
+
+
+def mosaic_places(sigma_px: float, kelvin: float, image: str, off_px: FloatArray) -> MosaicPlaces:
+    """A row by the errors of places, px, of either sign."""
+    rms_px = float(np.sqrt((off_px**2).mean()))
+    return MosaicPlaces(sigma_px, kelvin, image, rms_px, float(np.abs(off_px).max()))
 
 
 def mosaic_off_px(image: FloatArray, width_px: float, steps: FloatArray) -> FloatArray:
@@ -646,10 +705,30 @@ def choice_panel(error: str, ylabel: str) -> PanelSpec:
     return PanelSpec((points,), ylabel, scales=("log", "log"), names=False)
 
 
+@dataclass(frozen=True, slots=True)
+class ColourMeasured:
+    """The rows of each table by its name, and the work of others while choices were timed; `red`
+    has a sensor and the share of each class.
+    """
+
+    choices: Sequence[ColourChoice]
+    gamut: Sequence[GamutRow]
+    by_class: Sequence[GamutClass]
+    lateral: Sequence[LateralColour]
+    red: Sequence[tuple[str | float, ...]]
+    mosaic: Sequence[MosaicPlaces]
+    load: Load
+
+
 def run(directory: Path, quick: bool = False) -> Judged:
     """Write colour.csv and its chart, and the tables colour_gamut, _class, _lateral, _red and
     _mosaic; findings.
     """
+    return report(directory, measure(quick))
+
+
+def measure(quick: bool) -> ColourMeasured:
+    """Every panel's gamut, the lateral colours, the choices of codes, and the mosaic's places."""
     fields = FIELDS
     rounds = ROUNDS
     before = dict(TRACKERS)
@@ -664,26 +743,37 @@ def run(directory: Path, quick: bool = False) -> Judged:
         gamut, by_class = study_gamut(folder)
         lateral = list(study_lateral(folder))
         choices = list(study_choices(folder, before, fields, rounds))
-        red = []
-        for sensor in (*MONO, *SENSORS):
-            tracker = file_of(folder, "OLED", sensor).config.tracker
-            shares = class_shares(bench_optics(tracker, folder), RED_NM)
-            red.append((sensor, *shares.values()))
+        load = others.load()
+        red = red_shares(folder)
         wide = file_of(folder, "OLED", TRACKERS["Bayer"]).config.tracker
         mosaic = list(study_mosaic(bench_channels(wide, folder)))
-    write_rows(directory / "colour.csv", choices)
-    write_rows(directory / "colour_gamut.csv", gamut)
-    write_rows(directory / "colour_class.csv", by_class)
-    write_rows(directory / "colour_lateral.csv", lateral)
-    write_csv(directory / "colour_red.csv", ("sensor", *LETTERS), red)
-    write_rows(directory / "colour_mosaic.csv", mosaic)
-    load = others.load()
-    lines = [draw(directory / "colour", choices, load)]
-    lines += map(lateral_line, lateral)
-    for places in mosaic:
+    return ColourMeasured(choices, gamut, by_class, lateral, red, mosaic, load)
+
+
+def red_shares(folder: Path) -> list[tuple[str | float, ...]]:
+    """Each sensor, and the share of light that the stars of each class have beyond RED_NM."""
+    rows: list[tuple[str | float, ...]] = []
+    for sensor in (*MONO, *SENSORS):
+        tracker = file_of(folder, "OLED", sensor).config.tracker
+        shares = class_shares(bench_optics(tracker, folder), RED_NM)
+        rows.append((sensor, *shares.values()))
+    return rows
+
+
+def report(directory: Path, measured: ColourMeasured) -> Judged:
+    """Write what was measured; findings. Raises InputError."""
+    write_rows(directory / "colour.csv", measured.choices)
+    write_rows(directory / "colour_gamut.csv", measured.gamut)
+    write_rows(directory / "colour_class.csv", measured.by_class)
+    write_rows(directory / "colour_lateral.csv", measured.lateral)
+    write_csv(directory / "colour_red.csv", ("sensor", *LETTERS), measured.red)
+    write_rows(directory / "colour_mosaic.csv", measured.mosaic)
+    lines = [draw(directory / "colour", measured.choices, measured.load)]
+    lines += map(lateral_line, measured.lateral)
+    for places in measured.mosaic:
         if places.sigma_px == QUOTED_SIGMA_PX:
             lines.append(mosaic_line(places))
-    return load.judged(lines)
+    return measured.load.judged(lines)
 
 
 def lateral_line(row: LateralColour) -> str:

@@ -2,7 +2,7 @@
 the effort that two tolerances need, with the times of whole frames and the errors of stars.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -14,7 +14,6 @@ import numpy as np
 
 from hilstar.basics.charts import BLUE, MUTED, ORANGE, RED
 from hilstar.basics.rotation import from_radec_roll_deg
-from hilstar.display.response import Levels
 from hilstar.instruments.study.engine import (
     BarSpec,
     ChartSpec,
@@ -27,6 +26,7 @@ from hilstar.instruments.study.engine import (
 from hilstar.instruments.study.study_benches import (
     FULL_HD,
     GLASS,
+    LoneErrors,
     Table,
     lone_errors,
     study_bench,
@@ -34,6 +34,7 @@ from hilstar.instruments.study.study_benches import (
 from hilstar.instruments.study.sweep import NOT_JUDGED, Judged, Load, OtherWork, Spent, in_turn
 from hilstar.optics.frame_motion import CameraTurn
 from hilstar.server.bench.config.render import DEFAULT_TOLERANCE_MAG, DEFAULT_TOLERANCE_PX
+from hilstar.server.bench.drawn import Drawn
 from hilstar.server.bench.frame import Bench
 from hilstar.tracker.centroiders import FAMILY
 
@@ -81,6 +82,7 @@ SCENES: tuple[EffortScene, ...] = (
     EffortScene("wide, Milky Way", (305.0, 40.0, 20.0), 120.0, 8.0),
     EffortScene("wide, Milky Way, 1 deg/s", (305.0, 40.0, 20.0), 120.0, 7.0, (0.6, 0.8, 0.0)),
 )
+CASES = tuple(product(BITS, SCENES))
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,21 +147,41 @@ class EffortComparison:
         return self.full.frame_ms / self.auto.frame_ms
 
 
+@dataclass(frozen=True, slots=True)
+class EconomyMeasured:
+    """Each scene's outcomes at each depth, full effort first, and the work of others meanwhile."""
+
+    groups: Sequence[Sequence[EffortOutcome]]
+    load: Load
+
+
 def run(directory: Path, quick: bool = False) -> Judged:
     """Measure every scene, and write `economy.csv` and its chart; a line for each comparison.
     Raises InputError.
     """
+    return report(directory, measure(quick))
+
+
+def measure(quick: bool, cases: Sequence[tuple[int, EffortScene]] = CASES) -> EconomyMeasured:
+    """The outcomes of scenes on panels of so many bits."""
     others = OtherWork()
     rounds = QUICK_ROUNDS if quick else ROUNDS
+    groups = []
+    for bits, scene in cases:
+        groups.append(compare(scene, bits, rounds))
+    return EconomyMeasured(groups, others.load())
+
+
+def report(directory: Path, measured: EconomyMeasured) -> Judged:
+    """Write what was measured; a line for each comparison. Raises InputError."""
+    load = measured.load
     comparisons = []
-    rows = []
-    for bits, scene in product(BITS, SCENES):
-        full, *autos = compare(scene, bits, rounds)
+    rows: list[EffortOutcome] = []
+    for full, *autos in measured.groups:
         rows += [full, *autos]
         for auto in autos:
             comparisons.append(EffortComparison(full, auto))
     write_rows(directory / "economy.csv", rows)
-    load = others.load()
     draw(directory / "economy", comparisons, load)
     lines = []
     for comparison in comparisons:
@@ -174,8 +196,10 @@ def effort_keys(tolerance: EffortTolerance) -> Table:
     return {**AUTO, "tolerance_mag": tolerance.mag, "tolerance_px": tolerance.px}
 
 
-def compare(scene: EffortScene, bits: int, rounds: int) -> list[EffortOutcome]:
-    """A scene at full effort and at the effort that each of TOLERANCES needs, timed in turn."""
+def bench_tables(scene: EffortScene, bits: int) -> dict[str, dict[str, Table]]:
+    """The bench files' tables of a scene at full effort, and at the effort that each of TOLERANCES
+    needs, by the effort's name.
+    """
     tables: dict[str, Table] = {
         "tracker": {"resolution_px": (1024, 1024), "transmission": GLASS},
         "sky": {"faintest_v_mag": scene.faintest_v_mag},
@@ -187,33 +211,56 @@ def compare(scene: EffortScene, bits: int, rounds: int) -> list[EffortOutcome]:
     efforts: dict[str, Table] = {"full": FULL}
     for tolerance in TOLERANCES:
         efforts[tolerance.name] = effort_keys(tolerance)
+    return {name: {**tables, "render": {**scene_keys, **keys}} for name, keys in efforts.items()}
+
+
+def compare(scene: EffortScene, bits: int, rounds: int) -> list[EffortOutcome]:
+    """A scene at full effort and at the effort that each of TOLERANCES needs, timed in turn."""
     with TemporaryDirectory() as folder, ExitStack() as stack:
         benches = {}
-        works: dict[str, Callable[[int], object]] = {}
-        for name, keys in efforts.items():
-            path = Path(folder) / f"{name}.toml"
-            bench = study_bench(path, {**tables, "render": {**scene_keys, **keys}})
+        for name, tables in bench_tables(scene, bits).items():
+            bench = study_bench(Path(folder) / f"{name}.toml", tables)
             benches[name] = stack.enter_context(bench)
-            works[name] = partial(frame_of, bench, scene.turn)
-        times = in_turn(works, rounds)
+        times = in_turn(frame_works(benches, scene.turn), rounds)
         outcomes = []
         for name, bench in benches.items():
-            outcomes.append(outcome(scene, name, bench, times[name]))
+            drawn = frame_of(bench, scene.turn, 0)
+            errors = lone_errors(bench, scene.turn, drawn.levels)
+            found = FrameErrors(drawn.star_count, errors)
+            outcomes.append(outcome(scene, name, bench, found, times[name]))
         return outcomes
 
 
-def frame_of(bench: Bench, turn: CameraTurn, number: int) -> Levels:
-    """The levels of one of the frames that are timed."""
-    return bench.draw(turn.q_icrs_to_cam, number, turn.rate_cam_rad_s).levels
+def frame_works(
+    benches: Mapping[str, Bench], turn: CameraTurn
+) -> dict[str, Callable[[int], Drawn]]:
+    """What is timed of each bench: a frame of the turn, by its number."""
+    works: dict[str, Callable[[int], Drawn]] = {}
+    for name, bench in benches.items():
+        works[name] = partial(frame_of, bench, turn)
+    return works
 
 
-def outcome(scene: EffortScene, name: str, bench: Bench, times: Sequence[Spent]) -> EffortOutcome:
+def frame_of(bench: Bench, turn: CameraTurn, number: int) -> Drawn:
+    """One of the frames of a turn."""
+    return bench.draw(turn.q_icrs_to_cam, number, turn.rate_cam_rad_s)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameErrors:
+    """How many stars a frame shows, and the errors of those that stand alone."""
+
+    stars: int
+    lone: LoneErrors
+
+
+def outcome(
+    scene: EffortScene, name: str, bench: Bench, found: FrameErrors, times: Sequence[Spent]
+) -> EffortOutcome:
     """The errors of a scene's stars at one effort, and the times of its frames."""
     tolerances = {tolerance.name: tolerance for tolerance in TOLERANCES}
     tolerance = tolerances.get(name, DEFAULT)
-    turn = scene.turn
-    drawn = bench.draw(turn.q_icrs_to_cam, 0, turn.rate_cam_rad_s)
-    errors = lone_errors(bench, turn, drawn.levels)
+    errors = found.lone
     max_px = {}
     for kind in FAMILY:
         distance_px = np.hypot(*errors.off_px[kind])
@@ -226,7 +273,7 @@ def outcome(scene: EffortScene, name: str, bench: Bench, times: Sequence[Spent])
         tolerance_mag=tolerance.mag,
         tolerance_px=tolerance.px,
         quantisation=bench.config.render.quantisation,
-        stars=drawn.star_count,
+        stars=found.stars,
         frame_ms=frame_ms,
         cpu_ms=cpu_ms,
         claimed_mag=bench.effort.error_mag,
@@ -296,7 +343,8 @@ def draw(path: Path, comparisons: Sequence[EffortComparison], load: Load) -> Non
     """
     title = load.title(economy_finding(comparisons), f"Auto effort is {within_words(comparisons)}")
     looks = {}
-    for bits, tolerance in product(BITS, TOLERANCES):
+    depths = sorted({comparison.auto.bits for comparison in comparisons})
+    for bits, tolerance in product(depths, TOLERANCES):
         fade = {"alpha": 1.0 if tolerance is DEFAULT else 0.5}
         look = SeriesLook(f"{bits} bits, {tolerance.name}", COLOURS[bits], more=fade)
         looks[bits, tolerance.name] = look

@@ -2,7 +2,7 @@
 light.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -213,7 +213,11 @@ def cost_of(bench: Bench, folder: Path, case: str, rounds: int) -> FaultCost:
     """The time of a frame with the faults of a case and without any, in turn."""
     frames = CaseFrames(bench, folder, case)
     ms = medians_ms({"without": frames.without, "with": frames.with_faults}, rounds)
-    quantisation = bench.config.render.quantisation
+    return fault_cost(bench.config.render.quantisation, case, ms)
+
+
+def fault_cost(quantisation: str, case: str, ms: Mapping[str, float]) -> FaultCost:
+    """The cost of a case by the times of its frames "with" and "without" it."""
     cost_ms = ms["with"] - ms["without"]
     return FaultCost(quantisation, case, ms["with"], ms["without"], cost_ms)
 
@@ -234,10 +238,14 @@ def stray_light(bench: Bench, share: float) -> Stray:
     light_alone = replace(no_sprites, extended=lights)
     alone = light_of(bench, light_alone)
     errors_mag = light_errors_mag(sprites, both - alone, bench.camera.resolution_px)
+    return stray_of(bench.config.render.quantisation, share, errors_mag)
+
+
+def stray_of(quantisation: str, share: float, errors_mag: Sequence[float]) -> Stray:
+    """A row by the errors of stars' light, mag."""
     median, p95 = np.percentile(errors_mag, (50, 95)).tolist()
     is_lost = np.array(errors_mag) > LOST_MAG
-    lost = float(is_lost.mean())
-    return Stray(bench.config.render.quantisation, share, len(errors_mag), median, p95, lost)
+    return Stray(quantisation, share, len(errors_mag), median, p95, float(is_lost.mean()))
 
 
 def light_errors_mag(
@@ -264,10 +272,24 @@ def light_of(bench: Bench, sprites: FrameLight) -> FloatArray:
     return shown_light(levels, bench.panel).copy()
 
 
+@dataclass(frozen=True, slots=True)
+class FaultsMeasured:
+    """The costs of faults, the errors under stray light, and the work of others meanwhile."""
+
+    costs: Sequence[FaultCost]
+    strays: Sequence[Stray]
+    load: Load
+
+
 def run(directory: Path, quick: bool = False) -> Judged:
     """Measure; write `faults-cost.csv`, `faults-stray.csv` and their charts; the findings, a
     line each. Raises InputError.
     """
+    return report(directory, measure(quick))
+
+
+def measure(quick: bool) -> FaultsMeasured:
+    """Every case and every share of stray light, with each quantisation."""
     costs: list[FaultCost] = []
     strays: list[Stray] = []
     rounds = QUICK_ROUNDS if quick else ROUNDS
@@ -281,7 +303,12 @@ def run(directory: Path, quick: bool = False) -> Judged:
                     costs.append(cost_of(bench, Path(name), case, rounds))
                 for share in shares:
                     strays.append(stray_light(bench, share))
-    load = others.load()
+    return FaultsMeasured(costs, strays, others.load())
+
+
+def report(directory: Path, measured: FaultsMeasured) -> Judged:
+    """Write what was measured; the findings, a line each. Raises InputError."""
+    costs, strays, load = measured.costs, measured.strays, measured.load
     write_rows(directory / "faults-cost.csv", costs)
     write_rows(directory / "faults-stray.csv", strays)
     draw_stray(directory / "faults", strays)

@@ -22,7 +22,6 @@ from hilstar.instruments.calibrate.geometric.fit import (
     BROWN_CONRADY,
     PINHOLE,
     RADIAL,
-    Geometry,
     Model,
     Nominal,
     fit,
@@ -347,9 +346,7 @@ def line_of(outcome: CalibrationOutcome) -> str:
 def ideal_arcsec() -> float:
     """The error of stars without any calibration, arcsec rms over the screen."""
     nominal = _nominal()
-    still_turn = np.eye(4)[:1]
-    still = Geometry(nominal.monitor, nominal.q_cam_to_mon, TRACKER, still_turn)
-    errors = _star_errors(still)
+    errors = _star_errors(nominal.monitor)
     return float(np.sqrt(np.square(errors).mean()))
 
 
@@ -374,7 +371,7 @@ def _outcomes(frames: Frames) -> Iterator[CalibrationOutcome]:
         free = Model(model.parameters)
         of_dots = held_out(problem, model.name, free, model.field_degree, data)
         fitted = fit(problem, free, model.field_degree, data)
-        errors = _star_errors(fitted.geometry)
+        errors = _star_errors(fitted.geometry.monitor)
         stars_rms_arcsec = float(np.sqrt((errors**2).mean()))
         yield CalibrationOutcome(
             frames=frames.count,
@@ -388,18 +385,27 @@ def _outcomes(frames: Frames) -> Iterator[CalibrationOutcome]:
         )
 
 
-def _star_errors(geometry: Geometry) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """The distances between shown stars and their traced places, arcsec (STARS,)."""
+def star_places_px(size_px: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+    """Places (x, y) of STARS stars all over a screen of `size_px` (width, height)."""
     rng = np.random.default_rng(SEED)
-    width, height = BENCH.resolution_px
-    x = rng.uniform(-0.5, width - 0.5, STARS)
-    y = rng.uniform(-0.5, height - 0.5, STARS)
-    monitor = geometry.monitor
-    directions = BENCH.directions(x, y)
-    in_image = directions @ monitor.cam_to_image.T
-    shown_x, shown_y = monitor.project(in_image)
-    off_px = np.hypot(shown_x - x, shown_y - y)
+    width, height = size_px
+    x_px = rng.uniform(-0.5, width - 0.5, STARS)
+    return x_px, rng.uniform(-0.5, height - 0.5, STARS)
+
+
+def off_arcsec(
+    monitor: Camera, x_px: FloatArray, y_px: FloatArray, directions: FloatArray
+) -> FloatArray:
+    """The distances (n,) from places on the screen to where a camera shows their directions."""
+    shown_x, shown_y = monitor.project(directions @ monitor.cam_to_image.T)
+    off_px = np.hypot(shown_x - x_px, shown_y - y_px)
     return np.asarray(off_px * ARCSEC_PER_RAD / monitor.focal_length_px)
+
+
+def _star_errors(monitor: Camera) -> FloatArray:
+    """The distances between shown stars and their traced places, arcsec (STARS,)."""
+    x_px, y_px = star_places_px(BENCH.resolution_px)
+    return off_arcsec(monitor, x_px, y_px, BENCH.directions(x_px, y_px))
 
 
 def draw(

@@ -5,9 +5,10 @@ or of a bench, for the same three fields and any other.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -85,18 +86,26 @@ def run(
             scene = OutputScene(field.stem, title, field)
             lines.append(_output(directory, file, scene))
         return lines
+    for name, scene in thesis_scenes():
+        lines.append(_output(directory, thesis_bench(name), scene))
+    return lines
+
+
+def thesis_scenes() -> Iterator[tuple[str, OutputScene]]:
+    """The thesis's fields, as published and mended, each with its bench file's name."""
     for field in FIELDS:
         figures = FIGURES[field.stem]
         published = f"{field.name} as published (thesis figures {figures})"
         mended = f"{field.name} with the thesis's errors mended"
         stem = field.stem + PUBLISHED
-        bench = thesis_bench(f"thesis-{field.stem}-as-published.toml")
-        published_scene = OutputScene(stem, published, field, field.zoom_hip)
-        lines.append(_output(directory, bench, published_scene))
-        bench = thesis_bench(f"thesis-{field.stem}.toml")
-        mended_scene = OutputScene(field.stem, mended, field, field.zoom_hip)
-        lines.append(_output(directory, bench, mended_scene))
-    return lines
+        yield (
+            f"thesis-{field.stem}-as-published.toml",
+            OutputScene(stem, published, field, field.zoom_hip),
+        )
+        yield (
+            f"thesis-{field.stem}.toml",
+            OutputScene(field.stem, mended, field, field.zoom_hip),
+        )
 
 
 def thesis_bench(name: str) -> BenchFile:
@@ -261,7 +270,7 @@ def _draw_property(axes: "Axes", values: FloatArray, name: str, unit: str) -> No
 def _draw_images(panels: "list[Axes]", scene: OutputScene, outputs: Outputs) -> None:
     """The images without and with noise, each with its zoom, and beside them scale and camera."""
     star, (x_px, y_px) = _zoom(scene, outputs)
-    low, high = stretch_dn(outputs)
+    low, high = stretch_dn(outputs.noisy.dn, outputs.noise_e, outputs.gain_e_per_dn)
     images = (outputs.clean, outputs.clean, outputs.noisy, outputs.noisy)
     titles = ("Without noise", f"The same, {star}", "With noise", f"The same, {star}")
     drawn = [panels[0], panels[1], panels[3], panels[4]]
@@ -282,13 +291,14 @@ def _draw_images(panels: "list[Axes]", scene: OutputScene, outputs: Outputs) -> 
     )
 
 
-def stretch_dn(outputs: Outputs) -> tuple[float, float]:
+def stretch_dn(
+    noisy_dn: npt.NDArray[Any], noise_e: float, gain_e_per_dn: float
+) -> tuple[float, float]:
     """The DN that are black and white in all images: by the noisy one's pixels, within limits by
     the sky's noise.
     """
-    low, high = np.percentile(outputs.noisy.dn, STRETCH_PERCENT).tolist()
-    sky_noise_dn = outputs.noise_e / outputs.gain_e_per_dn
-    noise_dn = max(sky_noise_dn, 0.1)
+    low, high = np.percentile(noisy_dn, STRETCH_PERCENT).tolist()
+    noise_dn = max(noise_e / gain_e_per_dn, 0.1)
     lowest = low + MIN_SIGMAS * noise_dn
     highest = low + MAX_SIGMAS * noise_dn
     return low, float(np.clip(high, lowest, highest))

@@ -11,11 +11,11 @@ Then the prediction of a vibration beside a steady turn, against its frequency: 
 import math
 import time
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -112,24 +112,44 @@ class Shaken:
     residual: float
 
 
+@dataclass(frozen=True, slots=True)
+class PredictionMeasured:
+    """The errors and times on the slew, the errors of vibrations, and the work of others while
+    the slew was timed.
+    """
+
+    outcomes: Sequence[PredictionOutcome]
+    shaken: Sequence[Shaken]
+    load: Load
+
+
 def run(directory: Path, quick: bool = False) -> Judged:
     """Measure, and write `prediction.csv` and its chart; a line for each method. Raises
     InputError.
     """
+    return report(directory, measure(quick))
+
+
+def measure(quick: bool) -> PredictionMeasured:
+    """Every predictor on the slew, and every way of prediction on vibrations."""
     others = OtherWork()
-    span_s = QUICK_SPAN_S if quick else SPAN_S
-    outcomes = slew_outcomes(span_s)
+    outcomes = slew_outcomes(QUICK_SPAN_S if quick else SPAN_S)
     load = others.load()
+    return PredictionMeasured(outcomes, shaken_rows(quick), load)
+
+
+def report(directory: Path, measured: PredictionMeasured) -> Judged:
+    """Write what was measured; a line for each method. Raises InputError."""
+    outcomes = measured.outcomes
     write_rows(directory / "prediction.csv", outcomes)
     usual = [row for row in outcomes if is_usual(row.rate_hz, row.latency_ms)]
     finding = slew_finding(usual)
-    draw(directory / "prediction", finding, outcomes, load)
-    shaken = shaken_rows(quick)
-    write_rows(directory / "prediction_jitter.csv", shaken)
-    note = shaken_finding(shaken)
-    draw_shaken(directory / "prediction_jitter", note, shaken)
+    draw(directory / "prediction", finding, outcomes, measured.load)
+    write_rows(directory / "prediction_jitter.csv", measured.shaken)
+    note = shaken_finding(measured.shaken)
+    draw_shaken(directory / "prediction_jitter", note, measured.shaken)
     lines = map(line_of, usual)
-    return load.judged([finding, *lines, note])
+    return measured.load.judged([finding, *lines, note])
 
 
 def is_usual(packet_hz: int, age_ms: int) -> bool:
@@ -174,23 +194,41 @@ def line_of(row: PredictionOutcome) -> str:
     return f"{row.method}: {errors}, {row.attitude_us:.0f} us per attitude"
 
 
+class ShakenCase(NamedTuple):
+    """A vibration with one way of prediction; see `Shaken`."""
+
+    way: Way
+    packets: str
+    packet_hz: int
+    age_ms: int
+    jitter_hz: int
+
+
 def shaken_rows(quick: bool) -> list[Shaken]:
     """A vibration by every way of prediction, with and without rates."""
+    rows = []
+    for case in shaken_cases(quick):
+        way, packets, packet_hz, age_ms, jitter_hz = case
+        has_rates = packets == SENDERS[0]
+        residual, gain = shaken_error(way, jitter_hz, packet_hz, age_ms, has_rates)
+        rows.append(Shaken(*case, gain, residual))
+    return rows
+
+
+def shaken_cases(quick: bool) -> Iterator[ShakenCase]:
+    """Each vibration under half of the packets' rate, by every way of prediction, with and without
+    rates.
+    """
     cells: tuple[tuple[int, int], ...] = SHAKEN_CELLS
     frequencies: tuple[int, ...] = SHAKEN_HZ
     if quick:
         cells = QUICK_SHAKEN_CELLS
         frequencies = QUICK_SHAKEN_HZ
-    rows = []
     for packets, cell, way, jitter_hz in product(SENDERS, cells, WAYS, frequencies):
         packet_hz, age_ms = cell
         if jitter_hz >= packet_hz / 2:
             continue  # it looks like a slow one
-        has_rates = packets == SENDERS[0]
-        residual, gain = shaken_error(way, jitter_hz, packet_hz, age_ms, has_rates)
-        row = Shaken(way, packets, packet_hz, age_ms, jitter_hz, gain, residual)
-        rows.append(row)
-    return rows
+        yield ShakenCase(way, packets, packet_hz, age_ms, jitter_hz)
 
 
 def shaken_finding(rows: Sequence[Shaken]) -> str:
@@ -327,7 +365,7 @@ def _outcome(
     return PredictionOutcome(predictor.name, rate_hz, latency_ms, rms, max(errors), median_us)
 
 
-def draw(path: Path, finding: str, outcomes: list[PredictionOutcome], load: Load) -> None:
+def draw(path: Path, finding: str, outcomes: Sequence[PredictionOutcome], load: Load) -> None:
     """The pointing error of each predictor, by latency and by the rate of packets."""
     shaken = ", ".join(f"{size:g} arcsec at {hz:g} Hz" for size, hz in JITTER)
     note = (
@@ -376,7 +414,7 @@ def has_usual_latency(row: PredictionOutcome) -> bool:
     return row.latency_ms == USUAL_MS
 
 
-def draw_shaken(path: Path, finding: str, shaken: list[Shaken]) -> None:
+def draw_shaken(path: Path, finding: str, shaken: Sequence[Shaken]) -> None:
     """A vibration's error and amplitude as shown, by its frequency; with and without rates."""
     note = (
         f"Packets at {USUAL_HZ} Hz, the newest {USUAL_MS} ms old at light on the mean; a vibration"

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from hilstar.basics.arrays import FloatArray
 from hilstar.basics.charts import BLUE, INK, ORANGE, SMALL_PT
 from hilstar.basics.units import flux_ratio
 from hilstar.display.phases import USUAL_PSF, WHITE
@@ -93,13 +94,36 @@ class CentroiderErrors:
         return self.exact_px / self.round_px
 
 
+@dataclass(frozen=True, slots=True)
+class QuantisationMeasured:
+    """The errors of every way, the times with the work of others meanwhile, and the errors over
+    several frames.
+    """
+
+    rows: Sequence[WayErrors]
+    timed: Sequence[TimedWay]
+    load: Load
+    over_frames: Sequence[codes.OverFrames]
+
+
 def run(directory: Path, quick: bool = False) -> Judged:
     """Write the charts and their tables (CSV) into `directory`; a line for each finding."""
+    return report(directory, measure(quick))
+
+
+def measure(quick: bool) -> QuantisationMeasured:
+    """Every way's errors over magnitudes, its times, and its errors over frames."""
     rows = way_errors(quick)
-    write_rows(directory / "quantisation.csv", rows)
     others = OtherWork()
     timed = timed_ways(rows, QUICK_ROUNDS if quick else ROUNDS)
     load = others.load()
+    return QuantisationMeasured(rows, timed, load, codes.measure_frames(quick))
+
+
+def report(directory: Path, measured: QuantisationMeasured) -> Judged:
+    """Write what was measured; a line for each finding. Raises InputError."""
+    rows, timed, load = measured.rows, measured.timed, measured.load
+    write_rows(directory / "quantisation.csv", rows)
     by_centroider = centroider_errors(rows)
     draw_magnitudes(directory / "quantisation", rows)
     draw_each(directory / "quantisation_centroiders", by_centroider)
@@ -109,17 +133,20 @@ def run(directory: Path, quick: bool = False) -> Judged:
     for bits in codes.BITS:
         lines.append(summary(bits, rows))
     lines += [centroiders_line(by_centroider), times_line(timed)]
-    lines.append(codes.study_frames(directory, quick))
+    lines.append(codes.report_frames(directory, measured.over_frames))
     return load.judged(lines)
+
+
+def phases_and_mags(quick: bool) -> tuple[int, FloatArray]:
+    """Sub-pixel phases along an axis, and magnitudes under white."""
+    if quick:
+        return 8, np.linspace(0, 8, 5)
+    return 32, np.linspace(0, 10, 41)
 
 
 def way_errors(quick: bool) -> list[WayErrors]:
     """The errors of every way over magnitudes."""
-    phases = 32
-    mags = np.linspace(0, 10, 41)
-    if quick:
-        phases = 8
-        mags = np.linspace(0, 8, 5)
+    phases, mags = phases_and_mags(quick)
     rows = []
     for bits, way in product(codes.BITS, codes.WAYS):
         errors = codes.code_errors(bits, way, phases, mags)

@@ -510,7 +510,7 @@ def lone_paths(
     return list(study_benches.lone_windows(paths, x_px, y_px, size_px, ISOLATION))
 
 
-def beat_findings(points: list[BeatPoint], directory: Path) -> list[str]:
+def beat_findings(points: Sequence[BeatPoint], directory: Path) -> list[str]:
     """Write `beat.csv` and its chart; a line for each case. Raises InputError."""
     write_rows(directory / "beat.csv", points)
     cases: dict[TimingCase, list[BeatPoint]] = {}
@@ -634,7 +634,7 @@ def compare(panel: ScanningPanel, sky: TimingSky, movement: Movement) -> TimingO
     )
 
 
-def measure(quick: bool = False) -> list[TimingOutcome]:
+def measure_slews(quick: bool = False) -> list[TimingOutcome]:
     """Every compensation at every rate."""
     with TemporaryDirectory() as folder, ExitStack() as stack:
         panels = []
@@ -647,20 +647,41 @@ def measure(quick: bool = False) -> list[TimingOutcome]:
         return outcomes
 
 
+@dataclass(frozen=True, slots=True)
+class TimingMeasured:
+    """Every compensation at every rate with the work of others meanwhile, and the stars of the
+    beat's exposures.
+    """
+
+    outcomes: Sequence[TimingOutcome]
+    load: Load
+    beats: Sequence[BeatPoint]
+
+
 def run(directory: Path, quick: bool = False) -> Judged:
     """Measure, and write `timing`, `beat` and `stripes`, each as csv and png; the findings, a
     line each. Raises InputError.
     """
+    return report(directory, measure(quick))
+
+
+def measure(quick: bool) -> TimingMeasured:
+    """The slews, and the exposures that beat with the refresh."""
     others = OtherWork()
-    outcomes = measure(quick)
-    load = others.load()
+    outcomes = measure_slews(quick)
+    return TimingMeasured(outcomes, others.load(), measure_beat(quick))
+
+
+def report(directory: Path, measured: TimingMeasured) -> Judged:
+    """Write what was measured; the findings, a line each. Raises InputError."""
+    outcomes, load = measured.outcomes, measured.load
     write_rows(directory / "timing.csv", outcomes)
     finding = draw(directory / "timing", outcomes, load)
     lines = [finding]
     for outcome in outcomes:
         if outcome.rate_deg_s == QUICK_RATES_DEG_S[0]:
             lines.append(line_of(outcome))
-    lines += beat_findings(measure_beat(quick), directory)
+    lines += beat_findings(measured.beats, directory)
     lines += stripe_findings(directory)
     return load.judged(lines)
 
@@ -672,7 +693,7 @@ def line_of(outcome: TimingOutcome) -> str:
     return f"{outcome.way}: {errors}, {outcome.flux_rms_mag:.2g} mag rms, {cost}"
 
 
-def draw(path: Path, outcomes: list[TimingOutcome], load: Load) -> str:
+def draw(path: Path, outcomes: Sequence[TimingOutcome], load: Load) -> str:
     """The chart of the outcomes; its finding."""
     rms_arcsec = {}
     for outcome in outcomes:

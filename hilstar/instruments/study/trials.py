@@ -102,36 +102,43 @@ class Trials:
 
 
 def measured(step: Trials, budget_s: float) -> Trials:
-    """Time the methods of a step in turn, mark the front, and put the fastest first.
-
-    On a busy machine no method is on the front, and none is said to beat the default.
-    """
+    """Time the methods of a step in turn, put the fastest first, and judge them."""
     others = OtherWork()
     works = {}
     for trial in step.trials:
         works[trial.method] = partial(called, trial.work)
     times = in_turn(works, MAX_ROUNDS, budget_s / len(works))
     load = others.load()
-    quartiles = []
-    for taken in times.values():
-        quartiles.append(quartiles_ms(taken))
-    middle_ms = [middle for _, middle, _ in quartiles]
+    timed = []
+    for trial in step.trials:
+        low, middle, high = quartiles_ms(times[trial.method])
+        timed.append(replace(trial, time_ms=middle, quartiles_ms=(low, high)))
+    timed.sort(key=lambda trial: trial.time_ms)
+    return judged(replace(step, trials=timed, load=load))
+
+
+def judged(step: Trials) -> Trials:
+    """A step whose methods are timed, with its front, and what beats its default.
+
+    On a busy machine no method is on the front, and none is said to beat the default.
+    """
     errors = []
     for trial in step.trials:
         errors.append(max(trial.error, step.error.floor))
+    times_ms = [trial.time_ms for trial in step.trials]
     # On a busy machine every method counts as beaten: none is on the front.
-    beaten = beaten_by(errors, middle_ms) | load.busy
-    timed = []
-    for trial, (low, middle, high), beats in zip(step.trials, quartiles, beaten, strict=True):
-        on_front = not beats.any()
-        timed.append(replace(trial, time_ms=middle, quartiles_ms=(low, high), on_front=on_front))
-    default = next(k for k, trial in enumerate(timed) if trial.is_default)
-    if not timed[default].on_front and not load.busy:
-        better = [trial for trial, beats in zip(timed, beaten[default], strict=True) if beats]
-        best = min(better, key=lambda trial: trial.time_ms)
-        why = f"{beaten_words(timed[default], best)}; {step.why_default}"
-        timed[default] = replace(timed[default], beaten=why)
-    return replace(step, trials=sorted(timed, key=lambda trial: trial.time_ms), load=load)
+    beaten = beaten_by(errors, times_ms) | step.load.busy
+    trials = []
+    for trial, beats in zip(step.trials, beaten, strict=True):
+        why = ""
+        if trial.is_default and beats.any() and not step.load.busy:
+            better = [
+                rival for rival, is_better in zip(step.trials, beats, strict=True) if is_better
+            ]
+            best = min(better, key=lambda rival: rival.time_ms)
+            why = f"{beaten_words(trial, best)}; {step.why_default}"
+        trials.append(replace(trial, on_front=not beats.any(), beaten=why))
+    return replace(step, trials=trials)
 
 
 def called(work: Callable[[], object], _: int) -> object:

@@ -600,11 +600,20 @@ class Comparison:
 
     def _on_detector(self, seen: TwinField, margin_px: float) -> npt.NDArray[np.bool_]:
         """Stars on the detector, `margin_px` or farther from its edge; one at NaN is not on it."""
-        width, height = self.twin.camera.resolution_px
-        first_px = margin_px - 0.5
-        across = (seen.x_px >= first_px) & (seen.x_px < width - 0.5 - margin_px)
-        down = (seen.y_px >= first_px) & (seen.y_px < height - 0.5 - margin_px)
-        return np.asarray(across & down)
+        return on_detector(seen.x_px, seen.y_px, self.twin.camera.resolution_px, margin_px)
+
+
+def on_detector(
+    x_px: FloatArray, y_px: FloatArray, resolution_px: tuple[int, int], margin_px: float
+) -> npt.NDArray[np.bool_]:
+    """Which places (n,) are on a detector, `margin_px` or farther from its outermost pixels' edges;
+    NaN is not on it.
+    """
+    width, height = resolution_px
+    first_px = margin_px - 0.5
+    across = (x_px >= first_px) & (x_px < width - 0.5 - margin_px)
+    down = (y_px >= first_px) & (y_px < height - 0.5 - margin_px)
+    return np.asarray(across & down)
 
 
 def channel_errors_mag(

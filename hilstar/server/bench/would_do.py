@@ -17,6 +17,7 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
 from hilstar.basics.units import flux_ratio
 from hilstar.display.calibration import load_calibration
+from hilstar.display.quantise import Quantisation
 from hilstar.display.response import Response
 from hilstar.optics.psf import GaussianPsf
 from hilstar.server.bench.config import GAUSSIAN, RenderSettings
@@ -59,7 +60,7 @@ class Remedy:
 
 
 @dataclass(frozen=True, slots=True)
-class _Trial:
+class Trial:
     """A bench with changes: what of it they may touch."""
 
     render: RenderSettings
@@ -67,15 +68,19 @@ class _Trial:
     faintest_v_mag: float
     changes: tuple[Change, ...] = ()
 
-    def but(self, key: str, value: Value, **changed: Any) -> "_Trial":
+    def but(self, key: str, value: Value, **changed: Any) -> "Trial":
         """The trial with one more change."""
         return replace(self, changes=(*self.changes, Change(key, value)), **changed)
 
-    def rendered(self, key: str, value: Value, **more: Value) -> "_Trial":
+    def rendered(self, key: str, value: Value, **more: Value) -> "Trial":
         """The trial with another value of a key of [render]."""
         changed: dict[str, Value] = {key: value, **more}
         render = msgspec.structs.replace(self.render, **changed)
         return self.but(f"[render] {key}", value, render=render)
+
+
+Way = Callable[[Trial], Iterator[Trial]]  # a key's changes, the smallest first
+Judge = Callable[[Trial], bool]  # whether a bench with changes is within its tolerance
 
 
 class _Trials:
@@ -92,22 +97,22 @@ class _Trials:
         faintest = float(self._stars.v_mag.max(initial=-99.0))
         faintest_v_mag = min(bench.file.config.sky.faintest_v_mag, faintest)
         asked = bench.effort.asked
-        self.start = _Trial(asked, bench.file.config.monitor.bits, faintest_v_mag)
-        self.ways: tuple[Callable[[_Trial], Iterator[_Trial]], ...] = (
+        self.start = Trial(asked, bench.file.config.monitor.bits, faintest_v_mag)
+        self.ways: tuple[Way, ...] = (
             self._more_bits,
             self._stolen_bits,
             self._exact_codes,
             self._codes_over_frames,
             self._brighter,
-            self._wider,
+            wider,
             self._shallower,
         )
 
-    def effort(self, trial: _Trial) -> Effort:
+    def effort(self, trial: Trial) -> Effort:
         """The plan of a bench with changes."""
         return plan_effort(trial.render, self._light(trial))
 
-    def _light(self, trial: _Trial) -> Light:
+    def _light(self, trial: Trial) -> Light:
         light = self._bench.effort.light
         if trial.render.sprite_sigma_px != self.start.render.sprite_sigma_px:
             light = replace(light, psf=GaussianPsf(trial.render.sprite_sigma_px))
@@ -121,7 +126,7 @@ class _Trials:
             white_e_per_s=white_e_per_s * self._bench.darkest,
         )
 
-    def _response(self, trial: _Trial) -> Response:
+    def _response(self, trial: Trial) -> Response:
         start = self.start
         stealing = trial.render.bit_stealing
         if (trial.bits, stealing) == (start.bits, start.render.bit_stealing):
@@ -130,16 +135,12 @@ class _Trials:
         source = calibration_source(file.config.monitor, file.folder)
         return load_calibration(source, trial.bits, bit_stealing=stealing).response
 
-    def _more_bits(self, trial: _Trial) -> Iterator[_Trial]:
-        """More bits, of a response that exists for any number of them."""
+    def _more_bits(self, trial: Trial) -> Iterator[Trial]:
         if not self._bench.calibration.is_formula:
-            return
-        for bits in BITS:
-            more = trial.but("[monitor] bits", bits, bits=bits)
-            if bits > trial.bits and self._exists(more):
-                yield more
+            return iter(())
+        return more_bits(trial, self._exists)
 
-    def _stolen_bits(self, trial: _Trial) -> Iterator[_Trial]:
+    def _stolen_bits(self, trial: Trial) -> Iterator[Trial]:
         bench = self._bench
         if bench.colours is not None or not bench.calibration.can_steal_bits:
             return
@@ -147,7 +148,7 @@ class _Trials:
         if not trial.render.bit_stealing and self._exists(stolen):
             yield stolen
 
-    def _exists(self, trial: _Trial) -> bool:
+    def _exists(self, trial: Trial) -> bool:
         """Whether there is a response: bits cannot be stolen of many."""
         try:
             self._response(trial)
@@ -155,47 +156,68 @@ class _Trials:
             return False
         return True
 
-    def _exact_codes(self, trial: _Trial) -> Iterator[_Trial]:
+    def _exact_codes(self, trial: Trial) -> Iterator[Trial]:
         """`exact`, where a slow machine or the file has other codes."""
         if self._bench.effort.quantisation != BEST:
             yield trial.rendered("quantisation", BEST)
 
-    def _codes_over_frames(self, trial: _Trial) -> Iterator[_Trial]:
+    def _codes_over_frames(self, trial: Trial) -> Iterator[Trial]:
         effort = self._bench.effort
-        if effort.light.exposure_frames > 1 and effort.quantisation != OVER_FRAMES:
-            yield trial.rendered("quantisation", OVER_FRAMES)
+        return codes_over_frames(trial, effort.light.exposure_frames, effort.quantisation)
 
-    def _brighter(self, trial: _Trial) -> Iterator[_Trial]:
-        """A full scale of fewer electrons: faint stars take more codes, and more bright ones
-        clip.
-        """
-        given = trial.render.flux_at_white_e_per_s
-        for mag in BRIGHTER_MAG:
-            if given is not None:
-                value = float(f"{given * flux_ratio(mag):.{DIGITS}g}")
-                yield trial.rendered("flux_at_white_e_per_s", value)
-                continue
-            value = (trial.render.brightest_v_mag or 0.0) + mag
-            if value > self._stars.v_mag.max(initial=0.0):
-                return
-            yield trial.rendered("brightest_v_mag", value)
+    def _brighter(self, trial: Trial) -> Iterator[Trial]:
+        return brighter(trial, float(self._stars.v_mag.max(initial=0.0)))
 
-    def _wider(self, trial: _Trial) -> Iterator[_Trial]:
-        """Stars over more pixels, each of which has its own rounding."""
-        if trial.render.psf != GAUSSIAN:
+    def _shallower(self, trial: Trial) -> Iterator[Trial]:
+        return shallower(trial, float(self._stars.v_mag.min(initial=99.0)))
+
+
+def more_bits(trial: Trial, exists: Callable[[Trial], bool]) -> Iterator[Trial]:
+    """More bits, of a response that exists for them."""
+    for bits in BITS:
+        more = trial.but("[monitor] bits", bits, bits=bits)
+        if bits > trial.bits and exists(more):
+            yield more
+
+
+def codes_over_frames(
+    trial: Trial, exposure_frames: float, quantisation: Quantisation
+) -> Iterator[Trial]:
+    """Codes that are right over an exposure of several frames, where a bench has others."""
+    if exposure_frames > 1 and quantisation != OVER_FRAMES:
+        yield trial.rendered("quantisation", OVER_FRAMES)
+
+
+def brighter(trial: Trial, faintest_v_mag: float) -> Iterator[Trial]:
+    """A full scale of fewer electrons: faint stars take more codes, and more bright ones clip."""
+    given = trial.render.flux_at_white_e_per_s
+    for mag in BRIGHTER_MAG:
+        if given is not None:
+            value = float(f"{given * flux_ratio(mag):.{DIGITS}g}")
+            yield trial.rendered("flux_at_white_e_per_s", value)
+            continue
+        value = (trial.render.brightest_v_mag or 0.0) + mag
+        if value > faintest_v_mag:
             return
-        for factor in WIDER:
-            x, y = (round(sigma * factor, 2) for sigma in trial.render.sprite_sigma_px)
-            yield trial.rendered("sprite_sigma_px", (x, y))
+        yield trial.rendered("brightest_v_mag", value)
 
-    def _shallower(self, trial: _Trial) -> Iterator[_Trial]:
-        """A catalogue that ends at brighter stars."""
-        brightest = float(self._stars.v_mag.min(initial=99.0))
-        for mag in SHALLOWER_MAG:
-            value = round(trial.faintest_v_mag - mag, 2)
-            if value < brightest:
-                return
-            yield trial.but("[sky] faintest_v_mag", value, faintest_v_mag=value)
+
+def wider(trial: Trial) -> Iterator[Trial]:
+    """Stars over more pixels, each of which has its own rounding."""
+    if trial.render.psf != GAUSSIAN:
+        return
+    for factor in WIDER:
+        x, y = (round(sigma * factor, 2) for sigma in trial.render.sprite_sigma_px)
+        yield trial.rendered("sprite_sigma_px", (x, y))
+
+
+def shallower(trial: Trial, brightest_v_mag: float) -> Iterator[Trial]:
+    """A catalogue that ends at brighter stars."""
+    for mag in SHALLOWER_MAG:
+        value = round(trial.faintest_v_mag - mag, 2)
+        if value < brightest_v_mag:
+            return
+        yield trial.but("[sky] faintest_v_mag", value, faintest_v_mag=value)
 
 
 def would_do(bench: Bench) -> list[Remedy]:
@@ -207,34 +229,34 @@ def would_do(bench: Bench) -> list[Remedy]:
     if bench.effort.within:
         return []
     trials = _Trials(bench)
-    alone = [_first_within(trials, way(trials.start)) for way in trials.ways]
-    remedies = _remedies(trials, alone)
-    if remedies:
-        return remedies
-    pairs = _remedies(trials, _pairs(trials))
-    if pairs:
-        return pairs
-    return _remedies(trials, [_largest(way, trials.start) for way in trials.ways])
-
-
-def _remedies(trials: _Trials, some: Sequence[_Trial | None]) -> list[Remedy]:
-    """The remedies of those trials that are not None, with the errors that each leaves."""
     remedies = []
-    for trial in some:
-        if trial is not None:
-            effort = trials.effort(trial)
-            remedy = Remedy(trial.changes, effort.error_mag, effort.error_px, effort.within)
-            remedies.append(remedy)
+    for trial in first_trials(trials.start, trials.ways, lambda one: trials.effort(one).within):
+        effort = trials.effort(trial)
+        remedies.append(Remedy(trial.changes, effort.error_mag, effort.error_px, effort.within))
     return remedies
 
 
-def _pairs(trials: _Trials) -> list[_Trial]:
+def first_trials(start: Trial, ways: Sequence[Way], is_within: Judge) -> list[Trial]:
+    """The smallest change of each key that is within alone; else the cheapest pairs of keys; else
+    the largest change of each key.
+    """
+    alone = [_first_within(way(start), is_within) for way in ways]
+    trials = [trial for trial in alone if trial is not None]
+    if trials:
+        return trials
+    pairs = _pairs(start, ways, is_within)
+    if pairs:
+        return pairs
+    largest = [_largest(way, start) for way in ways]
+    return [trial for trial in largest if trial is not None]
+
+
+def _pairs(start: Trial, ways: Sequence[Way], is_within: Judge) -> list[Trial]:
     """The first pairs of keys within the tolerance, each with the smallest changes that do."""
-    pairs: list[_Trial] = []
-    by_cost = sorted(combinations(range(len(trials.ways)), 2), key=lambda pair: pair[::-1])
-    for pair in by_cost:
-        cheaper, dearer = (trials.ways[place] for place in pair)
-        trial = _smallest_pair(trials, cheaper, dearer)
+    pairs: list[Trial] = []
+    by_cost = sorted(combinations(range(len(ways)), 2), key=lambda pair: pair[::-1])
+    for cheaper_place, dearer_place in by_cost:
+        trial = smallest_pair(start, ways[cheaper_place], ways[dearer_place], is_within)
         if trial is not None:
             pairs.append(trial)
         if len(pairs) == MAX_PAIRS:
@@ -242,37 +264,33 @@ def _pairs(trials: _Trials) -> list[_Trial]:
     return pairs
 
 
-def _smallest_pair(
-    trials: _Trials,
-    cheaper: Callable[[_Trial], Iterator[_Trial]],
-    dearer: Callable[[_Trial], Iterator[_Trial]],
-) -> _Trial | None:
+def smallest_pair(start: Trial, cheaper: Way, dearer: Way, is_within: Judge) -> Trial | None:
     """Of two keys the smallest change of the dearer one with any of the cheaper, and then of the
     cheaper; None where the largest of both are over the tolerance.
     """
-    utmost = _largest(cheaper, trials.start)
+    utmost = _largest(cheaper, start)
     if utmost is None:
         return None
     both = _largest(dearer, utmost)
     if both is None or len({change.key for change in both.changes}) == 1:
         return None  # both are ways to change the codes
-    if not trials.effort(both).within:
+    if not is_within(both):
         return None
-    changed = _first_within(trials, dearer(utmost))
+    changed = _first_within(dearer(utmost), is_within)
     if changed is None:
         return both
     smallest = changed.changes[-1]
-    for first in cheaper(trials.start):
+    for first in cheaper(start):
         for second in dearer(first):
-            if second.changes[-1] == smallest and trials.effort(second).within:
+            if second.changes[-1] == smallest and is_within(second):
                 return second
     return changed
 
 
-def _largest(way: Callable[[_Trial], Iterator[_Trial]], trial: _Trial) -> _Trial | None:
+def _largest(way: Way, trial: Trial) -> Trial | None:
     some = list(way(trial))
     return some[-1] if some else None
 
 
-def _first_within(trials: _Trials, some: Iterator[_Trial]) -> _Trial | None:
-    return next((trial for trial in some if trials.effort(trial).within), None)
+def _first_within(some: Iterator[Trial], is_within: Judge) -> Trial | None:
+    return next((trial for trial in some if is_within(trial)), None)

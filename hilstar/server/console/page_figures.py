@@ -9,7 +9,7 @@ the rows.
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import msgspec
 
@@ -17,7 +17,7 @@ from hilstar.attitude.wire.packet import Reason
 
 if TYPE_CHECKING:
     from hilstar.attitude.receiver import PacketCounts
-    from hilstar.server.loop import FrameLoop
+    from hilstar.server.summary import RunTally
 
 # The panels of the page; a HIDDEN figure is only in the state and the metrics, or drawn elsewhere.
 Panel = Literal["pointing", "source", "run", "tracker", ""]
@@ -47,16 +47,6 @@ class RunCounts(msgspec.Struct, frozen=True, kw_only=True):
     refused: dict[str, int] = {}
 
 
-class CountedRun(Protocol):
-    """The counters of a run that the page reads; see `hilstar.server.run_progress.Running`."""
-
-    @property
-    def loop(self) -> "FrameLoop": ...  # noqa: D102
-
-    @property
-    def packets(self) -> "PacketCounts": ...  # noqa: D102
-
-
 class FigureMetric(NamedTuple):
     """A metric of `GET /metrics`; its name lacks `hilstar_`, and its value is `scale` times the
     figure's.
@@ -82,7 +72,7 @@ class PageFigure:
     key: str
     unit: str = ""
     digits: int = 0
-    source: "Callable[[CountedRun], int | dict[str, int]] | None" = None
+    source: "Callable[[RunTally, PacketCounts], int | dict[str, int]] | None" = None
     form: Form = "number"
     text: str = "{}"
     none: str = NONE
@@ -144,14 +134,14 @@ FIGURES = (
         panel="run",
         name="Frames",
         key="counts.frames",
-        source=lambda run: run.loop.tally.frames,
+        source=lambda tally, packets: tally.frames,
         metric=FigureMetric("frames", "Frames shown.", "counter"),
     ),
     PageFigure(
         panel="run",
         name="Missed",
         key="counts.missed",
-        source=lambda run: run.loop.tally.missed_frames,
+        source=lambda tally, packets: tally.missed_frames,
         shade="warn",
         metric=FigureMetric(
             "frames_missed", "Refresh periods without a frame of their own.", "counter"
@@ -161,7 +151,7 @@ FIGURES = (
         panel="run",
         name="Stale",
         key="counts.stale",
-        source=lambda run: run.loop.tally.stale_frames,
+        source=lambda tally, packets: tally.stale_frames,
         shade="warn",
         metric=FigureMetric("frames_stale", "Frames shown with a stale attitude.", "counter"),
     ),
@@ -169,7 +159,7 @@ FIGURES = (
         panel="run",
         name="Given up",
         key="counts.given_up",
-        source=lambda run: run.loop.tally.given_up_frames,
+        source=lambda tally, packets: tally.given_up_frames,
         shade="warn",
         metric=FigureMetric(
             "frames_given_up", "Frames given up because their moment had passed.", "counter"
@@ -179,21 +169,21 @@ FIGURES = (
         panel=HIDDEN,
         name="Packets received",
         key="counts.received",
-        source=lambda run: run.packets.received,
+        source=lambda tally, packets: packets.received,
         metric=FigureMetric("packets_received", "Attitude packets received.", "counter"),
     ),
     PageFigure(
         panel="run",
         name="Packets",
         key="counts.accepted",
-        source=lambda run: run.packets.received - run.packets.refused,
+        source=lambda tally, packets: packets.received - packets.refused,
         text="{} of {counts.received} accepted",
     ),
     PageFigure(
         panel="run",
         name="Lost",
         key="counts.lost",
-        source=lambda run: run.packets.lost,
+        source=lambda tally, packets: packets.lost,
         shade="warn",
         metric=FigureMetric(
             "packets_lost",
@@ -205,7 +195,7 @@ FIGURES = (
         panel=HIDDEN,
         name="Packets refused",
         key="counts.refused",
-        source=lambda run: _some(run.packets.refused_by),
+        source=lambda tally, packets: _some(packets.refused_by),
         form="reasons",
     ),
     PageFigure(
@@ -348,12 +338,12 @@ def _some(counts: Mapping[Reason, int]) -> dict[str, int]:
     return {reason: count for reason, count in counts.items() if count}
 
 
-def counts_of(running: CountedRun) -> RunCounts:
-    """The counts of a run, each read by the source of its row."""
+def counts_of(tally: "RunTally", packets: "PacketCounts") -> RunCounts:
+    """The counts of a run's frames and packets, each read by the source of its row."""
     counts: dict[str, Any] = {}
     for figure in FIGURES:
         if figure.source is not None:
-            counts[figure.key.removeprefix(COUNTS)] = figure.source(running)
+            counts[figure.key.removeprefix(COUNTS)] = figure.source(tally, packets)
     return RunCounts(**counts)
 
 

@@ -204,7 +204,7 @@ class WatchedRun:
             frame=newest,
             attitude=_attitude(shown),
             clock=_clock(running),
-            counts=counts_of(running),
+            counts=counts_of(tally, running.packets),
             operator=aids.states(),
             operator_text=aids.text,
             overlay=aids.overlay,

@@ -7,6 +7,7 @@ import hashlib
 import math
 import re
 import zlib
+from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -399,22 +400,37 @@ def _answers(run: RunFigures, summary: RunReport) -> dict[str, Any] | None:
     """
     if not summary.answers:
         return None
-    zero_s = run.first_swap_ns / NS_PER_S
-    rows = run.residuals.rows
     faults = summary.answers.faults
-    edges = sorted(
-        (at_s, step)
-        for f in faults
-        for at_s, step in ((f.start_s, 1), (f.end_s or summary.duration_s, -1))
-    )
+    spans_s = [(fault.start_s, fault.end_s) for fault in faults]
+    on_s, on = faults_on(spans_s, summary.duration_s)
+    residuals = residuals_along(run.residuals.rows, run.answers.wrong_ns, run.first_swap_ns)
+    return residuals | {"on_s": on_s, "on": on, "faults": faults}
+
+
+def residuals_along(rows: FloatArray, wrong_ns: Sequence[int], begin_ns: int) -> dict[str, Any]:
+    """Residuals (n, 4), host time, s, and x, y, z, arcsec, and the host times of wrong answers as
+    the page has them: from the begin of the run on.
+    """
+    zero_s = begin_ns / NS_PER_S
     return {
         "t_s": _numbers(rows[:, 0] - zero_s, S_DIGITS),
         "xyz_arcsec": [_numbers(axis, MS_DIGITS) for axis in rows[:, 1:].T],
-        "wrong_s": [round(at_ns / NS_PER_S - zero_s, S_DIGITS) for at_ns in run.answers.wrong_ns],
-        "on_s": [at_s for at_s, _ in edges],
-        "on": np.cumsum([step for _, step in edges], dtype=int).tolist(),
-        "faults": faults,
+        "wrong_s": [round(at_ns / NS_PER_S - zero_s, S_DIGITS) for at_ns in wrong_ns],
     }
+
+
+def faults_on(
+    spans_s: Sequence[tuple[float, float | None]], duration_s: float
+) -> tuple[list[float], list[int]]:
+    """When the number of faults that are on changes, s, and that number from then on; a fault
+    without an end is on until the run's.
+    """
+    edges = []
+    for start_s, end_s in spans_s:
+        edges += [(start_s, 1), (end_s or duration_s, -1)]
+    edges.sort()
+    steps = [step for _, step in edges]
+    return [at_s for at_s, _ in edges], np.cumsum(steps, dtype=int).tolist()
 
 
 def _event(record: EventRecord, run: RunFigures) -> dict[str, Any]:

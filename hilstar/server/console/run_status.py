@@ -10,7 +10,7 @@ import math
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
@@ -58,10 +58,16 @@ class StatusLine(NamedTuple):
 class RunStatus:
     """The status of a run as text, from its counters and its newest frame."""
 
-    def __init__(self, source: RunSource, ledger: "LedgerSwitch | None" = None) -> None:
+    def __init__(
+        self,
+        source: RunSource,
+        ledger: "LedgerSwitch | None" = None,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
         self._source = source
         self._ledger = ledger
-        self._begun_ns = time.monotonic_ns()
+        self._clock_ns = clock_ns
+        self._begun_ns = clock_ns()
         self._shown: Shown | None = None
         self._running: Running | None = None
         # when the lines were last made: host time, frames, packets
@@ -85,7 +91,7 @@ class RunStatus:
         """
         running = self._running
         limit_ns = max(ALIVE_NS, ALIVE_PERIODS / self._source.refresh_hz * NS_PER_S)
-        return running is not None and time.monotonic_ns() - running.loop.watch.alive_ns < limit_ns
+        return running is not None and self._clock_ns() - running.loop.watch.alive_ns < limit_ns
 
     def line(self) -> str:
         """The status in one short line: a wrong sky, the attitude, frames and packets."""

@@ -78,6 +78,13 @@ class SwapClock:
         self.paced_by_screen = paced_by_screen
         self._phase_ns = float(first_ns)
 
+    @property
+    def measured_hz(self) -> float | None:
+        """The refresh rate of the screen; None where the grid is this program's own."""
+        if not self.paced_by_screen:
+            return None
+        return NS_PER_S / self.period_ns
+
     def update(self, swap_ns: int) -> None:
         """Add the time of a swap."""
         if not self.paced_by_screen:

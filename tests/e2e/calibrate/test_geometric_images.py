@@ -49,7 +49,7 @@ def image_of(x, y, rng, hot):
 def session(tmp_path_factory):
     folder = tmp_path_factory.mktemp("images")
     (folder / "bench.toml").write_text(FILE)
-    wanted = ("-o", folder / "plan", "--frames", "12", "--dots", "40")
+    wanted = ("-o", folder / "plan", "--frames", "10", "--dots", "24")
     assert run_hilstar_here("calibrate", "dots", folder / "bench.toml", *wanted).returncode == 0
     plan = read_plan(folder / "plan" / "plan.csv")
     x, y = TRACKER.project(BENCH.directions(plan.x_px, plan.y_px))
@@ -111,7 +111,7 @@ def test_images_that_are_taken_here_give_what_their_files_give(session, given, t
     grab = ("--grab", grabbing(session, tmp_path))
     run = run_hilstar_here(*words, "-o", tmp_path / "taken.toml", *grab)
     assert run.returncode == 0, run.stderr
-    assert "frame_011: image 12 of 12" in run.stderr
+    assert "frame_009: image 10 of 10" in run.stderr
     taken = json.loads(run.stdout)
     assert taken == given | {"written": taken["written"]}
     again = run_hilstar_here(*words, "-o", tmp_path / "again.toml", *grab)

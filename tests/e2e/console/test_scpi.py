@@ -344,9 +344,11 @@ def test_another_source_is_not_steered_and_a_page_may_stand_beside(tmp_path):
         )
 
 
-def test_beyond_this_machine_it_asks_for_the_token(open_scpi_run):
-    found, _ = open_scpi_run
-    with instrument(int(found[2])) as stand:
+def test_beyond_this_machine_it_asks_for_the_token(tmp_path):
+    with (
+        scpi_run(tmp_path, STEERED, at="0.0.0.0:0") as (_, found),
+        instrument(int(found[2])) as stand,
+    ):
         stand.write("SKY:ATT 1,0,0,0;BLANK ON;*RST")
         assert stand.errors() == [-203, -203, -203]
         stand.write('SYST:AUTH "guess"')

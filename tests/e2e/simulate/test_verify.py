@@ -263,18 +263,6 @@ def test_what_would_do_is_asked_of_frame_and_no_file_is_changed(tmp_path, option
     assert path.read_text() == BENCH
 
 
-def test_frame_explains_a_bench_without_a_file_to_write(tmp_path):
-    path = tmp_path / "bench.toml"
-    coarse = {"quantisation": "round", "tolerance_mag": 0.01, "tolerance_px": 0.01}
-    path.write_text(bench_text(TWIN, {"monitor": {"bits": 8}, "render": coarse}))
-    done = run_hilstar_here("frame", path, "--radec", "84,-1,0", "--explain", "--json")
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
-    assert found["written"] == []
-    assert not found["effort"]["within"]
-    assert "[monitor] bits" in [each["key"] for each in found["effort"]["would_do"]]
-
-
 @pytest.fixture(scope="module")
 def twin(tmp_path_factory):
     path = tmp_path_factory.mktemp("twin") / "bench.toml"

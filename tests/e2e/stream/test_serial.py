@@ -74,30 +74,6 @@ def test_two_hundred_a_second_arrive_none_lost_none_refused_and_both_sides_talk(
     assert summary["receive_latency_ms"]["p50"] is not None
 
 
-def test_lost_corrupted_and_reordered_packets_add_up(cable, wire_file):
-    with listening(wire_file, "reading serial:") as process:
-        faults = ["--lose", "10%", "--corrupt", "5%", "--reorder", "--jitter", "1", "--seed", "3"]
-        told = sent(
-            f"serial:{cable.sender}@{BAUD}",
-            "--spin",
-            "z,1",
-            "--rate",
-            "400",
-            "--count",
-            "400",
-            *faults,
-        )
-        process.has_received(told["sent"])
-        summary = interrupted(process)
-    packets = summary["packets"]
-    assert told["packets"] == 400
-    assert told["lost"] and told["corrupted"] and told["reordered"]
-    assert packets["received"] == told["sent"] == 400 - told["lost"]
-    assert packets["refused_by"]["crc"] == told["corrupted"]
-    assert packets["refused_by"]["time"] == told["reordered"]
-    assert packets["accepted"] == packets["received"] - told["corrupted"] - told["reordered"]
-
-
 def test_nothing_wrong_is_drawn_over_a_bad_cable(cable, wire_file):
     """A turn of 20 deg/s: every attitude drawn is that of its time, to what a packet's float32
     rate predicts in 100 ms.

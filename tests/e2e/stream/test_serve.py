@@ -110,21 +110,6 @@ def test_packets_at_200_hz_all_arrive_with_garbage_between_them(tmp_path):
     assert set(summary) == SUMMARY_KEYS
 
 
-def test_a_clean_stream_is_refused_nothing(tmp_path):
-    with publisher() as (sender, port), serving(tmp_path, port) as process:
-        process.shows()
-        for k in range(200):
-            sender.send(packet(k, time.monotonic_ns()))
-            time.sleep(0.0025)
-        process.has_received(200)
-        process.shows(process.counts()[0] + 2)
-        process.send_signal(signal.SIGTERM)
-        summary = summary_of(process)
-    assert (summary["packets"]["received"], summary["packets"]["refused"]) == (200, 0)
-    for key in ("p50", "p99", "max"):
-        assert summary["attitude_age_ms"][key] is not None
-
-
 def test_json_and_multipart_messages_are_taken(tmp_path):
     with publisher() as (sender, port), serving(tmp_path, port) as process:
         sender.send(json.dumps({"t_ns": 1_000_000, "q": [1, 0, 0, 0], "rate": [0, 0, 0]}).encode())
@@ -197,21 +182,9 @@ def test_hilstar_send_is_heard_by_serve_that_binds(tmp_path):
         assert "100 packets sent" in sent.stderr
         process.has_received(100)
         process.send_signal(signal.SIGINT)
-        packets = summary_of(process)["packets"]
-    assert (packets["received"], packets["refused"]) == (100, 0)
-
-
-def test_a_log_sent_at_a_rate_is_resampled(tmp_path):
-    (tmp_path / "log.csv").write_text("t_s,qw,qx,qy,qz\n5,1,0,0,0\n6,0.9999,0.01,0,0.0099\n")
-    port = free_port()
-    with serving(tmp_path, port) as process:
-        sent = run_hilstar(
-            "send", tmp_path / "log.csv", "--rate", "100", "--to", f"tcp://127.0.0.1:{port}"
-        )
-        assert "101 packets sent" in sent.stderr
-        process.has_received(101)
-        process.send_signal(signal.SIGINT)
-        assert summary_of(process)["packets"]["accepted"] == 101
+        summary = summary_of(process)
+    assert (summary["packets"]["received"], summary["packets"]["refused"]) == (100, 0)
+    assert None not in summary["attitude_age_ms"].values()
 
 
 def test_a_sender_that_restarts_is_taken_up_again(tmp_path):

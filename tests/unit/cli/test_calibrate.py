@@ -7,24 +7,29 @@ from __future__ import annotations
 import json
 from contextlib import nullcontext
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from hilstar.cli import calibrate
 from hilstar.cli.calibrate import (
+    FocusOptions,
     _check_focus_source,
     _focus_by_answers,
     _monitor_of_bench,
     _response_lines,
 )
+from hilstar.cli.pointing import PointingOptions
+from hilstar.display.identity import MonitorIdentity
 from hilstar.instruments.calibrate import alignment as alignment_engine
 from hilstar.instruments.calibrate import photometric as photometric_engine
 from hilstar.instruments.calibrate import scale as scale_engine
+from hilstar.instruments.calibrate.scale import MeasuredScale
 from hilstar.server.answers.star_widths import FocusFigure, FocusReading
 from hilstar.server.bench import build, frame_files
-from tests.support.benches import bench_text
+from hilstar.server.bench.bench_file import bench_file_of
+from tests.support.benches import SMALL_BENCH, bench_text
 from tests.support.commands import run_hilstar_here
 from tests.support.refusals import refusal
 from tests.support.tables import csv_rows
@@ -90,11 +95,8 @@ def test_channels_and_their_crosstalk_are_said_one_by_one():
     ],
 )
 def test_a_focus_is_measured_by_one_source_with_its_own_options(given, sky, words):
-    known = dict.fromkeys(("grab", "virtual", "exposure", "feed")) | {
-        "answers": False,
-        "headless": False,
-    }
-    options, pointing = SimpleNamespace(**(known | given)), SimpleNamespace(given=sky)
+    options = FocusOptions(bench_file=Path("bench.toml"), **given)
+    pointing = PointingOptions(star="Vega" if sky else None)
     if words is None:
         _check_focus_source(options, pointing)
     else:
@@ -110,8 +112,10 @@ def test_a_focus_is_measured_by_one_source_with_its_own_options(given, sky, word
         ("800x600@60", False),
     ],
 )
-def test_a_display_of_the_bench_s_size_was_measured_on_either_side(monkeypatch, mode, is_its):
-    identity = SimpleNamespace(mode=mode, name=lambda: "a monitor")
+def test_a_display_of_the_bench_s_size_was_measured_on_either_side(
+    tmp_path, monkeypatch, mode, is_its
+):
+    identity = MonitorIdentity(model="a monitor", mode=mode)
     asked = []
 
     def identity_here(display):
@@ -119,8 +123,9 @@ def test_a_display_of_the_bench_s_size_was_measured_on_either_side(monkeypatch, 
         return identity
 
     monkeypatch.setattr("hilstar.display.window.this_monitor.identity_here", identity_here)
-    monitor = SimpleNamespace(resolution_px=(1920, 1080), display="DP-1")
-    found = _monitor_of_bench(SimpleNamespace(config=SimpleNamespace(monitor=monitor)))
+    monitor = {"resolution_px": [1920, 1080], "display": "DP-1"}
+    file = bench_file_of(tmp_path / "bench.toml", bench_text({"monitor": monitor}))
+    found = _monitor_of_bench(file)
     assert (found is identity, asked) == (is_its, ["DP-1"])
 
 
@@ -153,17 +158,11 @@ def test_an_alignment_s_offset_is_added_to_the_telemetry_s_time(
         assert refused.returncode == 2 and "write seconds, less than 4e+09" in refused.stderr
 
 
-@pytest.mark.parametrize(("scatter_mag", "is_unsure"), [(0.0, False), (9.0, True)])
+@pytest.mark.parametrize(("ratios", "is_unsure"), [((1, 1, 1), False), ((1, 10, 100), True)])
 def test_a_scale_is_of_the_bench_s_exposure_and_told_with_its_error(
-    tmp_path, monkeypatch, scatter_mag, is_unsure
+    tmp_path, monkeypatch, ratios, is_unsure
 ):
-    found = SimpleNamespace(
-        flux_at_white_e_per_s=1234.5,
-        assumed_e_per_s=1000.0,
-        scatter_mag=scatter_mag,
-        relative_error=0.0123,
-        dof=2,
-    )
+    found = MeasuredScale(1234.5, 1000.0, np.array(ratios), np.ones(3), noise_mag=0.0133)
     given = []
 
     def scale_by_tracker(bench, readings, exposure_s):
@@ -178,10 +177,10 @@ def test_a_scale_is_of_the_bench_s_exposure_and_told_with_its_error(
     assert done.stdout.splitlines()[1:] == [
         "flux_at_white_e_per_s = 1234.5",
         "# and how well it is known, under [certify]:",
-        "flux_at_white_relative = 0.0123",
+        f"flux_at_white_relative = {found.relative_error:.3g}",
         "flux_at_white_dof = 2",
     ]
-    assert ("the readings disagree by 9.000 mag" in done.stderr) is is_unsure
+    assert ("the readings disagree by 2.500 mag" in done.stderr) is is_unsure
     run_calibrate(tmp_path, *words, "--exposure", "2")
     assert given == [(3, 0.25), (3, 2.0)]
 
@@ -302,8 +301,15 @@ def test_a_focus_ends_after_so_many_figures_or_at_a_signal(tmp_path, monkeypatch
     assert done.stdout.splitlines()[-1].endswith(": image 2 of 3, after 6 s")
 
 
-@pytest.mark.parametrize("form", ["packet", "frame"])
-def test_answers_without_stars_have_no_focus(form):
-    file = SimpleNamespace(config=SimpleNamespace(answers=SimpleNamespace(format=form)))
+FIELDS = ", ".join(
+    f'{{ name = "q{axis}", at = {4 * k}, type = "f32" }}' for k, axis in enumerate("wxyz")
+)
+FORMS = {"packet": "", "frame": f'framing = "fixed"\nlength = 16\nfields = [{FIELDS}]\n'}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_answers_without_stars_have_no_focus(tmp_path, form):
+    answers = f'[answers]\nsource = "udp"\nformat = "{form}"\n{FORMS[form]}'
+    file = bench_file_of(tmp_path / "bench.toml", SMALL_BENCH + answers)
     said = refusal(_focus_by_answers, file, None, None, None, None, None)
     assert f'format = "{form}" carries no stars' in said

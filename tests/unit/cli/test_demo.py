@@ -5,7 +5,6 @@ what is said of a sky that stood still.
 from __future__ import annotations
 
 import json
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,10 +13,11 @@ from msgspec.structs import replace
 
 from hilstar.attitude.receiver import PacketCounts
 from hilstar.server import demo
+from hilstar.server.replay import DrawnBy
 from hilstar.server.summary import RunTally
 from tests.support.commands import run_hilstar_here
 
-RENDERER: Any = SimpleNamespace(gl_renderer="none", gl_version="none", path="NumPy")
+RENDERER: Any = DrawnBy("none", "none", "NumPy")
 CODES = np.zeros((3, 4), np.uint16)
 
 

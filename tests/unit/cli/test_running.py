@@ -16,11 +16,12 @@ from msgspec.structs import replace as replaced
 from hilstar.attitude.receiver import PacketCounts
 from hilstar.basics.errors import InputError, MachineError
 from hilstar.basics.notices import Notices
-from hilstar.cli import first_light, image_source, running
+from hilstar.cli import first_light, image_source
 from hilstar.cli.image_source import DotOptions, dot_images
 from hilstar.cli.running import (
     ActingPageOptions,
     PageOptions,
+    RunOptions,
     dated_ledger,
     end_of_run,
     followed,
@@ -33,19 +34,22 @@ from hilstar.cli.running import (
     scpi_listener,
 )
 from hilstar.cli.shown_run import run_files
-from hilstar.cli.tracker import open_camera, recorded
+from hilstar.cli.tracker import open_camera
 from hilstar.instruments.calibrate import grabbed_dots
 from hilstar.instruments.calibrate.grabbed_dots import DotImages
-from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.bench_file import bench_file_of, read_bench_file
 from hilstar.server.bench.build import load
-from hilstar.server.bench.config import parse_config
 from hilstar.server.bench.scenario import NO_SCENARIO
+from hilstar.server.faults import NO_RECORDING, Recording, ReplayedFaults, RunFaults
 from hilstar.server.record.ledger import LedgerSwitch
+from hilstar.server.replay import DrawnBy
 from hilstar.server.summary import RunTally, RunVerdict
 from hilstar.server.watchdog import GPU_LOST
 from tests.support.benches import SMALL_BENCH, bench_text
+from tests.support.model_display import model_screen
+from tests.support.senders import free_port
 
-RENDERER = SimpleNamespace(gl_renderer="none", gl_version="none", path="NumPy")
+RENDERER = DrawnBy("none", "none", "NumPy")
 TOKEN = "0123456789abcdef-0123"
 
 
@@ -69,10 +73,8 @@ def ended(
     notices = Notices()
     if gpu:
         notices.begin(GPU_LOST, gpu)
-    screen = SimpleNamespace(window=SimpleNamespace(gone=gone))
-    ledger = SimpleNamespace(last=None, failure=failure)
     try:
-        end_of_run(summary, screen, ledger, notices, as_json=False, strict=strict)
+        end_of_run(summary, gone, failure, notices, as_json=False, strict=strict)
     except typer.Exit as exit_:
         return exit_.exit_code
     except MachineError as error:
@@ -168,7 +170,7 @@ def test_a_dark_frame_that_is_named_counts_in_place_of_the_one_that_was_taken(
     source = SimpleNamespace(close=lambda: None)
     monkeypatch.setattr(grabbed_dots, "grab_dots", lambda *_, **__: taken)
     monkeypatch.setattr(image_source, "real_source", lambda *_: source)
-    file = SimpleNamespace(config=parse_config(tmp_path / "bench.toml", SMALL_BENCH))
+    file = bench_file_of(tmp_path / "bench.toml", SMALL_BENCH)
     images = dot_images(file, [], tmp_path, DotOptions(grab="shoot {output}", dark=named))
     assert images == DotImages([Path("0.fits")], dark)
 
@@ -188,19 +190,12 @@ def test_images_of_dots_are_given_or_taken(tmp_path, given, options, words):
 
 
 def test_a_beat_is_with_the_refresh_that_was_measured_where_the_screen_paces(tmp_path):
-    path = tmp_path / "bench.toml"
-    path.write_text(bench_text({"monitor": {"refresh_hz": 60.0}}))
-    bench = SimpleNamespace(config=read_bench_file(path).config)
-    paced, unpaced = (
-        SimpleNamespace(
-            clock=SimpleNamespace(paced_by_screen=paces, period_ns=16_000_000),
-            window=SimpleNamespace(modes_hz=()),
-        )
-        for paces in (True, False)
-    )
-    assert say_beat(bench, paced).refresh_hz == 62.5
-    assert say_beat(bench, unpaced).refresh_hz == 60.0
-    assert say_beat(bench, None).refresh_hz == 60.0
+    screen, _ = model_screen(tmp_path)
+    config = screen.bench.config
+    for is_paced, refresh_hz in ((True, 62.5), (False, 60.0)):
+        screen.keep_time(16.0, is_paced, 0)
+        assert say_beat(config, screen).refresh_hz == refresh_hz
+    assert say_beat(config, None).refresh_hz == 60.0
 
 
 def test_a_tracker_s_camera_that_others_reach_needs_to_know_whom_to_let_in(tmp_path):
@@ -213,18 +208,6 @@ def test_a_tracker_s_camera_that_others_reach_needs_to_know_whom_to_let_in(tmp_p
         pass
 
 
-def test_an_answer_without_an_attitude_is_a_row_that_says_so(tmp_path):
-    path = tmp_path / "telemetry.csv"
-    with recorded(path) as row:
-        row(SimpleNamespace(t_ns=1_500_000_000, q_icrs_to_cam=None))
-        row(SimpleNamespace(t_ns=2_000_000_000, q_icrs_to_cam=(0.5, -0.5, 0.5, -0.5)))
-    assert path.read_text().splitlines() == [
-        "t_s,qw,qx,qy,qz,valid",
-        "1.500000000,,,,,0",
-        "2.000000000,0.5,-0.5,0.5,-0.5,1",
-    ]
-
-
 SCENARIO = (
     '[[fault]]\nkind = "blank"\nname = "cover"\nat_s = 0.5\nfor_s = 0.1\n'
     '[[fault]]\nkind = "freeze"\nname = "stuck"\n'
@@ -232,68 +215,44 @@ SCENARIO = (
 )
 
 
-def of_run(config: str = "") -> tuple[SimpleNamespace, Notices, SimpleNamespace]:
-    """A bench of 50 Hz, as far as faults ask for it, a run's notices and its ledger."""
-    bench = SimpleNamespace(
-        config=parse_config(Path("bench.toml"), SMALL_BENCH + config),
-        file=SimpleNamespace(folder=Path(), path=Path("bench.toml")),
-        scan=SimpleNamespace(period_ns=20_000_000),
-    )
-    return bench, Notices(), SimpleNamespace(fault=lambda record: None)
-
-
 def test_a_run_has_the_faults_of_its_scenario_its_stream_or_its_recording(
-    tmp_path, capsys, monkeypatch
+    tmp_path, capsys, bench_with
 ):
-    made: list[tuple[object, ...]] = []
-    listening = SimpleNamespace(endpoint=None)
-
-    class Faults:
-        def __init__(self, *given: object) -> None:
-            made.append(given)
-
-        def listening(self, settings: object, folder: Path):
-            return nullcontext(listening.endpoint)
-
-    monkeypatch.setattr("hilstar.server.faults.RunFaults", Faults)
     path = tmp_path / "scenario.toml"
     path.write_text(SCENARIO)
     scenario = optional_scenario(path)
     assert optional_scenario(None) is None
-    of = of_run()
-    with run_with_faults(of[0], None, *of[1:]) as none:
-        assert none is None and not made
-    with run_with_faults(of[0], scenario, *of[1:]) as faults:
-        assert isinstance(faults, Faults)
-        assert made == [(of[0], scenario, *of[1:])]
+    run = bench_with(), Notices(), LedgerSwitch()
+    with run_with_faults(run[0], None, *run[1:]) as none:
+        assert none is None
+    with run_with_faults(run[0], scenario, *run[1:]) as faults:
+        assert isinstance(faults, RunFaults) and faults.schedule.scenario is scenario
     assert capsys.readouterr().err == f"{path}: 3 faults, 2 of them at their time\n"
-    listening.endpoint = "tcp://127.0.0.1:7002"
-    of = of_run('[faults]\nendpoint = "tcp://127.0.0.1:7002"\n')
-    with run_with_faults(of[0], None, *of[1:]):
-        assert made[1][1] is NO_SCENARIO
-    assert capsys.readouterr().err == "faults: tcp://127.0.0.1:7002\n"
+    endpoint = f"tcp://127.0.0.1:{free_port()}"
+    streamed = bench_with(f'[faults]\nendpoint = "{endpoint}"\n')
+    with run_with_faults(streamed, None, *run[1:]) as faults:
+        assert faults.schedule.scenario is NO_SCENARIO
+    assert capsys.readouterr().err == f"faults: waiting for a sender at {endpoint}\n"
 
 
-def test_a_replay_has_the_faults_of_its_run_and_no_other(tmp_path, monkeypatch):
-    monkeypatch.setattr("hilstar.server.faults.ReplayedFaults", lambda *given: given)
+def test_a_replay_has_the_faults_of_its_run_and_no_other(tmp_path, bench_with):
     path = tmp_path / "scenario.toml"
     path.write_text(SCENARIO)
-    of = of_run()
-    recording = SimpleNamespace(faults=["one"])
-    with run_with_faults(of[0], None, *of[1:], recording) as faults:
-        assert faults == (of[0], recording, of[2])
+    bench, notices, ledger = bench_with(), Notices(), LedgerSwitch()
+    recording = Recording({1: optional_scenario(path).faults[0]}, 0, tmp_path)
+    with run_with_faults(bench, None, notices, ledger, recording) as faults:
+        assert isinstance(faults, ReplayedFaults)
     with (
         pytest.raises(InputError, match="faults of its own"),
-        run_with_faults(of[0], optional_scenario(path), *of[1:], recording),
+        run_with_faults(bench, optional_scenario(path), notices, ledger, recording),
     ):
         pass
-    with run_with_faults(of[0], None, *of[1:], SimpleNamespace(faults=[])) as faults:
+    with run_with_faults(bench, None, notices, ledger, NO_RECORDING) as faults:
         assert faults is None
 
 
-def test_what_follows_a_run_has_each_frame_in_its_order(monkeypatch):
+def test_what_follows_a_run_has_each_frame_in_its_order():
     """The record first, as it is what a failure leaves; then the status, then who watches."""
-    monkeypatch.setattr(running, "Service", lambda *_: nullcontext())
     seen: list[str] = []
 
     def sink(name: str):
@@ -315,7 +274,6 @@ def test_what_follows_a_run_has_each_frame_in_its_order(monkeypatch):
 
 @pytest.mark.parametrize("acts", [False, True])
 def test_a_page_follows_a_run_after_its_status_and_hands_on_what_is_asked_there(monkeypatch, acts):
-    monkeypatch.setattr(running, "Service", lambda *_: nullcontext())
     seen: list[object] = []
     requests, listener, scpi, parts = object(), object(), object(), object()
     description = SimpleNamespace(command="demo")
@@ -409,7 +367,7 @@ def test_the_files_of_a_run_are_read_or_written_and_never_both(tmp_path):
     scenario, log = tmp_path / "scenario.toml", tmp_path / "log.csv"
     scenario.write_text(SCENARIO)
     ledger = tmp_path / "run.mcap"
-    options = SimpleNamespace(ledger=ledger, scenario=scenario, overwrite=False, ledger_split=None)
+    options = RunOptions(ledger=ledger, scenario=scenario)
     found = run_files(options, file, [log], [tmp_path / "out.csv"])
     assert found.ledger == ledger and len(found.scenario.faults) == 3
     for inputs, output in (([log], log), ([], scenario), ([], file.path), ([], ledger)):

@@ -9,18 +9,18 @@ import signal
 import sys
 import threading
 import time
-from contextlib import nullcontext
+from collections.abc import Iterator
 from itertools import count, pairwise
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import TimeRequest
 from hilstar.server import heads
 from hilstar.server.bench.bench_file import read_heads
-from hilstar.server.heads import HeadProcess, HeadsRun, _hand_on, _told, head_command
+from hilstar.server.heads import HeadProcess, HeadsRun, _hand_on, head_command, summary_of
 from tests.support.damage import NO_JSON
 from tests.support.heads import heads_file
 from tests.support.waiting import wait_for
@@ -34,17 +34,11 @@ READY = (
 
 @pytest.mark.parametrize("output", NO_JSON)
 def test_a_head_whose_output_is_no_json_has_no_summary(output):
-    assert _told(SimpleNamespace(output=output, code=-9, restarts=2)) == {
-        "exit_code": -9,
-        "restarts": 2,
-        "summary": None,
-    }
+    assert summary_of(output) is None
 
 
 def test_a_summary_is_told():
-    assert _told(SimpleNamespace(output=b'{"frames": 3}\n', code=0, restarts=0))["summary"] == {
-        "frames": 3
-    }
+    assert summary_of(b'{"frames": 3}\n') == {"frames": 3}
 
 
 def python(code: str) -> list[str]:
@@ -156,16 +150,21 @@ def test_only_a_head_that_was_well_for_long_is_begun_again_after_the_shortest_pa
     assert pauses == [anew] * 2
 
 
+def arrived(event: Any) -> Arrival[Any]:
+    """What came 5 ns after this machine was started."""
+    return Arrival(5, event, b"")
+
+
 class Source:
     """A link that has something at each look, and does not speak back."""
 
     two_way = False
 
     def __init__(self) -> None:
-        self.arrivals = (SimpleNamespace(event=number) for number in count())
+        self.numbers: Iterator[Any] = count()
 
-    def receive(self, timeout_ms: int) -> list[SimpleNamespace]:
-        return [next(self.arrivals)]
+    def receive(self, timeout_ms: int) -> list[Arrival[Any]]:
+        return [arrived(next(self.numbers))]
 
     def send(self, packet: object) -> None:
         """Nobody listens."""
@@ -185,21 +184,30 @@ class Tended:
 def test_heads_are_fed_until_the_last_of_them_has_done(monkeypatch):
     monkeypatch.setattr(heads, "TEND_NS", -1)  # at each look
     given: list[int] = []
-    feed = SimpleNamespace(give=lambda arrival: given.append(arrival.event))
     early, late = Tended(1), Tended(5)
-    _hand_on(Source(), feed, [early, late], threading.Event())
+
+    def give(arrival: Arrival[Any]) -> None:
+        given.append(arrival.event)
+
+    _hand_on(Source(), give, [early, late], threading.Event())
     assert late.left == 0
     assert given == [0, 1, 2, 3, 4]
 
 
 def test_a_signal_ends_the_feeding_of_heads_that_have_more_to_do():
-    stop = threading.Event()
-    feed = SimpleNamespace(give=lambda arrival: stop.set())
-    _hand_on(Source(), feed, [Tended(10**9)], stop)
-    assert stop.is_set()
+    stop, source = threading.Event(), Source()
+    source.numbers = iter([TimeRequest(7, 11), "an attitude"])
+    given: list[object] = []
+
+    def give(arrival: Arrival[Any]) -> None:
+        given.append(arrival.event)
+        stop.set()
+
+    _hand_on(source, give, [Tended(10**9)], stop)
+    assert given == ["an attitude"]  # a question is for none of the heads
 
 
-def test_a_run_of_heads_is_what_each_said_and_what_came_in_went_on_but_for_a_question(
+def test_a_run_of_heads_is_what_each_said_and_a_question_that_came_in_is_answered(
     tmp_path, monkeypatch
 ):
     """The first two end by themselves, in order and by an error that no restart mends; the third
@@ -228,25 +236,19 @@ def test_a_run_of_heads_is_what_each_said_and_what_came_in_went_on_but_for_a_que
 
     monkeypatch.setattr(heads, "HeadProcess", Noted)
     monkeypatch.setattr(heads, "head_command", command)
-    feed = SimpleNamespace(given=[], give=lambda arrival: feed.given.append(arrival.event))
-    monkeypatch.setattr(heads, "Feed", lambda endpoint: nullcontext(feed))
     said: list[str] = []
     answered: list[object] = []
 
     class Link(Source):
-        """Asks for the time, and gives two attitudes and a signal once the third head waits."""
+        """Asks for the time, and gives a signal once the third head waits."""
 
         two_way = True
         looks = 0
 
-        def receive(self, timeout_ms: int) -> list[SimpleNamespace]:
+        def receive(self, timeout_ms: int) -> list[Arrival[Any]]:
             self.looks += 1
             if self.looks == 1:
-                events = ["first", TimeRequest(7, 11), "second"]
-                return [
-                    SimpleNamespace(event=event, host_ns=5, peer=None, back=None)
-                    for event in events
-                ]
+                return [arrived(TimeRequest(7, 11))]
             if "c: waits" in said and None not in (head.code for head in begun[:2]):
                 os.kill(os.getpid(), signal.SIGTERM)
             time.sleep(0.01)
@@ -256,7 +258,6 @@ def test_a_run_of_heads_is_what_each_said_and_what_came_in_went_on_but_for_a_que
             answered.append(packet)
 
     told = heads.run_heads(asked, Link(), said.append)
-    assert feed.given == ["first", "second"]
     assert [(reply.sequence, reply.t1_ns) for reply in answered] == [(7, 11)]
     assert list(told) == list(file.names)
     assert [each["exit_code"] for each in told.values()] == [0, 4, 0]

@@ -47,17 +47,10 @@ from hilstar.server.record.ledger_records import (
 )
 from hilstar.server.record.run_figures import RunFigures, figures_of, summarise
 from tests.support.full_disk import files_of_at_most
-from tests.support.ledgers import kept_bench
 from tests.support.refusals import refusal
 from tests.support.waiting import wait_for
 
-UNCERTIFIED = SimpleNamespace(certify=SimpleNamespace(certificate=None))
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
-
-
-@pytest.fixture(name="kept_bench")
-def bench_of_a_ledger(small_bench_file):
-    return kept_bench(small_bench_file)
 
 
 def keep(ledger: Ledger, first: int, last: int) -> None:
@@ -77,9 +70,9 @@ def read_topics(path):
     ]
 
 
-def test_a_ledger_goes_on_in_other_files_and_is_read_as_one(tmp_path, kept_bench):
+def test_a_ledger_goes_on_in_other_files_and_is_read_as_one(tmp_path, small_bench):
     path = tmp_path / "run.mcap"
-    with Ledger(path, kept_bench, split=SplitLimits(bytes=1)) as ledger:
+    with Ledger(path, small_bench, split=SplitLimits(bytes=1)) as ledger:
         keep(ledger, 0, 50)
         wait_for((tmp_path / "run.0001.mcap").exists, "the next file")
         keep(ledger, 50, 100)
@@ -103,10 +96,10 @@ def test_a_split_is_a_size_or_a_time():
 
 
 def test_a_disk_without_room_loses_frames_first_and_says_so_and_is_tried_again(
-    tmp_path, kept_bench
+    tmp_path, small_bench
 ):
     notices = Notices()
-    with Ledger(tmp_path / "run.mcap", kept_bench, notices) as ledger:
+    with Ledger(tmp_path / "run.mcap", small_bench, notices) as ledger:
         keep(ledger, 0, 10)
         wait_for(
             lambda: len(list(drawable_frames(ledger.path))) == 10, "the first frames on the disk"
@@ -121,7 +114,7 @@ def test_a_disk_without_room_loses_frames_first_and_says_so_and_is_tried_again(
     assert [frame.frame for frame in drawable_frames(tmp_path / "run.mcap")] == list(range(10))
 
 
-def test_a_ledger_that_cannot_be_begun_leaves_nothing(tmp_path, kept_bench, monkeypatch):
+def test_a_ledger_that_cannot_be_begun_leaves_nothing(tmp_path, small_bench, monkeypatch):
     """Neither a file that is half begun nor a descriptor of one."""
 
     def full(*_):
@@ -130,9 +123,9 @@ def test_a_ledger_that_cannot_be_begun_leaves_nothing(tmp_path, kept_bench, monk
     monkeypatch.setattr(ledger_module, "McapWriter", full)
     open_files = len(list(Path("/proc/self/fd").iterdir()))
     assert "choose another place for the ledger" in refusal(
-        Ledger, tmp_path / "run.mcap", kept_bench
+        Ledger, tmp_path / "run.mcap", small_bench
     )
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["bench.toml"]
+    assert not list(tmp_path.iterdir())
     assert len(list(Path("/proc/self/fd").iterdir())) == open_files
 
 
@@ -159,12 +152,12 @@ def disk_of(monkeypatch, free_bytes: int, total_bytes: int = 100_000_000_000) ->
 
 
 def test_of_a_disk_that_fills_packets_have_the_last_64_mb_and_its_state_is_said(
-    tmp_path, kept_bench, monkeypatch
+    tmp_path, small_bench, monkeypatch
 ):
     monkeypatch.setattr(ledger_module, "EACH_S", 0.0)
     disk_of(monkeypatch, 50_000_000_000)
     notices, path = Notices(), tmp_path / "run.mcap"
-    with Ledger(path, kept_bench, notices) as ledger:
+    with Ledger(path, small_bench, notices) as ledger:
         keep(ledger, 0, 10)
         wait_for(lambda: len(list(drawable_frames(path))) == 10, "the first frames on the disk")
         assert not notices.active
@@ -259,10 +252,10 @@ def harm_until_said(path, harm, notices):
     "harm", [delete, replace_by_another, cut_file, write_anew, write_longer, write_over]
 )
 def test_a_ledger_that_is_harmed_is_said_and_goes_on_in_another_file(
-    tmp_path, kept_bench, harm, split
+    tmp_path, small_bench, harm, split
 ):
     notices, path = Notices(), tmp_path / "run.mcap"
-    with Ledger(path, kept_bench, notices, split=split) as ledger:
+    with Ledger(path, small_bench, notices, split=split) as ledger:
         keep(ledger, 0, 10)
         wait_for(lambda: len(list(drawable_frames(path))) == 10, "the first frames on the disk")
         if split.bytes == 1:
@@ -279,11 +272,11 @@ def test_a_ledger_that_is_harmed_is_said_and_goes_on_in_another_file(
 
 
 @pytest.mark.parametrize("with_folder", [False, True])
-def test_a_ledger_that_is_harmed_at_the_very_end_is_said_too(tmp_path, kept_bench, with_folder):
+def test_a_ledger_that_is_harmed_at_the_very_end_is_said_too(tmp_path, small_bench, with_folder):
     """Also where no other can be begun any more."""
     folder = tmp_path / "runs"
     folder.mkdir()
-    with Ledger(folder / "run.mcap", kept_bench) as ledger:
+    with Ledger(folder / "run.mcap", small_bench) as ledger:
         keep(ledger, 0, 10)
         wait_for(
             lambda: len(list(drawable_frames(ledger.path))) == 10, "the first frames on the disk"
@@ -295,10 +288,10 @@ def test_a_ledger_that_is_harmed_at_the_very_end_is_said_too(tmp_path, kept_benc
     assert ledger.summary()["unrecorded"] >= 20
 
 
-def test_a_ledger_whose_folder_is_gone_is_said_and_the_run_goes_on(tmp_path, kept_bench):
+def test_a_ledger_whose_folder_is_gone_is_said_and_the_run_goes_on(tmp_path, small_bench):
     notices, folder = Notices(), tmp_path / "runs"
     folder.mkdir()
-    with Ledger(folder / "run.mcap", kept_bench, notices) as ledger:
+    with Ledger(folder / "run.mcap", small_bench, notices) as ledger:
         keep(ledger, 0, 10)
         wait_for(
             lambda: len(list(drawable_frames(ledger.path))) == 10, "the first frames on the disk"
@@ -312,9 +305,9 @@ def test_a_ledger_whose_folder_is_gone_is_said_and_the_run_goes_on(tmp_path, kep
     assert ledger.failure.endswith("run.mcap was deleted while it was written")
 
 
-def test_a_ledger_that_is_moved_touched_or_linked_is_whole(tmp_path, kept_bench):
+def test_a_ledger_that_is_moved_touched_or_linked_is_whole(tmp_path, small_bench):
     notices = Notices()
-    with Ledger(tmp_path / "run.mcap", kept_bench, notices) as ledger:
+    with Ledger(tmp_path / "run.mcap", small_bench, notices) as ledger:
         keep(ledger, 0, 10)
         (tmp_path / "link.mcap").hardlink_to(tmp_path / "run.mcap")
         (tmp_path / "run.mcap").touch()
@@ -326,9 +319,9 @@ def test_a_ledger_that_is_moved_touched_or_linked_is_whole(tmp_path, kept_bench)
     assert [frame.frame for frame in drawable_frames(tmp_path / "moved.mcap")] == list(range(20))
 
 
-def test_a_ledger_begun_in_the_place_of_another_knows_the_faults_that_are_on(tmp_path, kept_bench):
+def test_a_ledger_begun_in_the_place_of_another_knows_the_faults_that_are_on(tmp_path, small_bench):
     notices, path = Notices(), tmp_path / "run.mcap"
-    with LedgerSwitch(Ledger(path, kept_bench, notices)) as switch:
+    with LedgerSwitch(Ledger(path, small_bench, notices)) as switch:
         for number, event in ((9, "scenario"), (0, "start"), (1, "start"), (0, "end")):
             record = {
                 "name": f"f{number}",
@@ -370,9 +363,9 @@ def test_what_a_full_queue_dropped_is_counted_once_by_kind():
 
 
 def test_what_is_dropped_once_the_last_turn_is_written_is_unrecorded_too(
-    tmp_path, kept_bench, monkeypatch
+    tmp_path, small_bench, monkeypatch
 ):
-    ledger = Ledger(tmp_path / "run.mcap", kept_bench)
+    ledger = Ledger(tmp_path / "run.mcap", small_bench)
     keep(ledger, 0, 10)
     ledger.close()
     monkeypatch.setattr("hilstar.server.record.ledger.MAX_WAITING_BYTES", 0)
@@ -380,9 +373,9 @@ def test_what_is_dropped_once_the_last_turn_is_written_is_unrecorded_too(
     assert ledger.summary()["unrecorded"] == 6  # three packets and three frames
 
 
-def test_what_had_no_room_is_counted_in_the_ledger_by_its_kind(tmp_path, kept_bench, monkeypatch):
+def test_what_had_no_room_is_counted_in_the_ledger_by_its_kind(tmp_path, small_bench, monkeypatch):
     """A fault is counted as an event: a replay would lack either."""
-    ledger = Ledger(tmp_path / "run.mcap", kept_bench)
+    ledger = Ledger(tmp_path / "run.mcap", small_bench)
     with monkeypatch.context() as full:
         full.setattr(ledger_module, "MAX_WAITING_BYTES", 0)
         keep(ledger, 0, 3)
@@ -415,12 +408,12 @@ def of_topic(path: Path, wanted: str) -> list[bytes]:
 
 
 def test_a_disk_that_takes_nothing_is_told_by_the_frames_and_its_return_by_the_writer(
-    tmp_path, kept_bench, monkeypatch
+    tmp_path, small_bench, monkeypatch
 ):
     notices = Notices()
     told: list[str] = []
     notices.listen(lambda notice: told.append(notice.kind))
-    with Ledger(tmp_path / "run.mcap", kept_bench, notices) as ledger:
+    with Ledger(tmp_path / "run.mcap", small_bench, notices) as ledger:
         keep(ledger, 0, 1)
         assert "ledger-stalled" not in notices.active
         with monkeypatch.context() as slow:
@@ -432,7 +425,7 @@ def test_a_disk_that_takes_nothing_is_told_by_the_frames_and_its_return_by_the_w
 
 
 def test_a_split_ledger_that_cannot_go_on_elsewhere_stays_and_says_so(
-    tmp_path, kept_bench, monkeypatch
+    tmp_path, small_bench, monkeypatch
 ):
     """Its next part's name is taken by a folder."""
     notices = Notices()
@@ -440,7 +433,7 @@ def test_a_split_ledger_that_cannot_go_on_elsewhere_stays_and_says_so(
     notices.listen(lambda notice: told.append(notice.kind))
     (tmp_path / "run.0001.mcap").mkdir()
     split = SplitLimits(bytes=1.0)
-    with Ledger(tmp_path / "run.mcap", kept_bench, notices, split=split) as ledger:
+    with Ledger(tmp_path / "run.mcap", small_bench, notices, split=split) as ledger:
         keep(ledger, 0, 5)
         wait_for(lambda: "ledger-split-failed" in told)
         keep(ledger, 5, 8)
@@ -475,11 +468,13 @@ class LedgerTime:
         wait_for(lambda: self._turns > before + 2)
 
 
-def test_a_ledger_that_is_split_by_its_age_begins_each_part_anew(tmp_path, kept_bench, monkeypatch):
+def test_a_ledger_that_is_split_by_its_age_begins_each_part_anew(
+    tmp_path, small_bench, monkeypatch
+):
     passing = LedgerTime(monkeypatch)
     path = tmp_path / "run.mcap"
     files = []
-    with Ledger(path, kept_bench, split=SplitLimits(seconds=60.0)) as ledger:
+    with Ledger(path, small_bench, split=SplitLimits(seconds=60.0)) as ledger:
         for seconds in (59.0, 2.0, 57.0, 0.0, 3.0):
             passing.pass_by(seconds)
             files.append(ledger.summary().get("files", 1))
@@ -487,14 +482,14 @@ def test_a_ledger_that_is_split_by_its_age_begins_each_part_anew(tmp_path, kept_
 
 
 def test_a_ledger_that_is_harmed_again_and_again_rests_twice_as_long(
-    tmp_path, kept_bench, monkeypatch
+    tmp_path, small_bench, monkeypatch
 ):
     """One second, two, and at most three."""
     monkeypatch.setattr(ledger_module, "MAX_REST_S", 3.0)
     passing = LedgerTime(monkeypatch)
     notices = Notices()
     rested_s = []
-    with Ledger(tmp_path / "run.mcap", kept_bench, notices) as ledger:
+    with Ledger(tmp_path / "run.mcap", small_bench, notices) as ledger:
         for harmed in range(1, 5):
             ledger.path.unlink()
             passing.pass_by(0.0)
@@ -505,9 +500,9 @@ def test_a_ledger_that_is_harmed_again_and_again_rests_twice_as_long(
     assert rested_s == [0.0, 1.5, 2.5, 3.5]
 
 
-def test_a_ledger_needs_no_new_file_once_it_has_begun(tmp_path, kept_bench):
+def test_a_ledger_needs_no_new_file_once_it_has_begun(tmp_path, small_bench):
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
-    with Ledger(tmp_path / "run.mcap", kept_bench) as ledger:
+    with Ledger(tmp_path / "run.mcap", small_bench) as ledger:
         resource.setrlimit(resource.RLIMIT_NOFILE, (3, limits[1]))
         try:
             keep(ledger, 0, 10)
@@ -637,8 +632,8 @@ def test_a_report_s_memory_does_not_grow_with_the_run():
     assert begin[lost > 0] == pytest.approx(70_000 / 60, abs=1.1)
 
 
-def test_refused_packets_are_counted_by_reason(tmp_path, kept_bench):
-    with Ledger(tmp_path / "run.mcap", kept_bench) as ledger:
+def test_refused_packets_are_counted_by_reason(tmp_path, small_bench):
+    with Ledger(tmp_path / "run.mcap", small_bench) as ledger:
         for k in range(500):
             ledger.packet(
                 1000 + k, b"x" * 5000, None, Refusal("crc" if k % 5 else "norm", "d" * 5000)
@@ -657,9 +652,9 @@ def test_refused_packets_are_counted_by_reason(tmp_path, kept_bench):
 
 
 def test_what_a_flood_left_out_is_counted_and_pulses_and_losses_are_no_messages(
-    tmp_path, kept_bench
+    tmp_path, small_bench
 ):
-    with Ledger(tmp_path / "run.mcap", kept_bench) as ledger:
+    with Ledger(tmp_path / "run.mcap", small_bench) as ledger:
         for _ in range(7):
             ledger.pulse("sent")
         ledger.lost(5)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import replace
-from types import SimpleNamespace
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -17,44 +16,23 @@ from hilstar.basics.notices import Notices
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.server import serve
 from hilstar.server.answers.answer import Answer, ReportedStar
-from hilstar.server.answers.judge import AnswerRules
+from hilstar.server.answers.judge import Judged
+from hilstar.server.answers.pairing import Lit
+from hilstar.server.bench.config import parse_config
 from hilstar.server.live_answers import MAX_JUDGED_HZ, LiveAnswers, wrong_line
 from hilstar.server.operator import OnScreen
 from hilstar.server.pacer import Shown
 from hilstar.server.record.ledger_records import AnswerRecord, schema_of
+from tests.support.benches import SMALL_BENCH
+from tests.support.drawn import drawn
 from tests.support.fake_clock import FakeClock
+from tests.support.queued_answers import RULES, Queued
 from tests.support.waiting import wait_for
 
 Q = np.array([1.0, 0.0, 0.0, 0.0])
 AWAY = np.array([np.cos(0.1), 0.0, np.sin(0.1), 0.0])  # 11 degrees
-BENCH = SimpleNamespace(
-    config=SimpleNamespace(monitor=SimpleNamespace(refresh_hz=60.0)),
-    scan=SimpleNamespace(hold_s=0.0),
-)
-RULES = AnswerRules(0.1, clock="host")
-DRAWN = SimpleNamespace(rate_cam_rad_s=None)
-
-
-class Queued:
-    """Answers that wait, and what was refused; `unread` says why nothing is read."""
-
-    unread = ""
-
-    def __init__(self) -> None:
-        self.waiting: deque[Answer] = deque()
-        self.refused: dict[str, int] = {}
-
-    def take(self) -> list[Answer]:
-        return [self.waiting.popleft() for _ in range(len(self.waiting))]
-
-    def refusals(self) -> dict[str, int]:
-        return self.refused
-
-    def trouble(self) -> str:
-        return ""
-
-    def close(self) -> None:
-        pass
+MONITOR = parse_config(Path("bench.toml"), SMALL_BENCH).monitor
+DRAWN = drawn(np.zeros((3, 4), np.uint8))
 
 
 class Kept:
@@ -76,7 +54,7 @@ def second_of_frames(answers: LiveAnswers, **more) -> None:
 
 def test_widths_of_stars_are_the_focus_and_stay_in_the_ledger():
     source, kept, clock = Queued(), Kept(), FakeClock(NS_PER_S)
-    answers = LiveAnswers(BENCH, RULES, source, Notices(), kept, clock=clock)
+    answers = LiveAnswers(MONITOR, RULES, source, Notices(), kept, clock=clock)
     stars = tuple(ReportedStar(9.0, 9.0, 300.0, None, width) for width in (1.2, 1.3, 1.4))
     with answers.running():
         second_of_frames(answers)
@@ -92,7 +70,7 @@ def test_widths_of_stars_are_the_focus_and_stay_in_the_ledger():
 
 def test_answers_are_judged_recorded_and_told_beside_the_frames():
     source, kept, notices, clock = Queued(), Kept(), Notices(), FakeClock(NS_PER_S)
-    answers = LiveAnswers(BENCH, RULES, source, notices, kept, clock=clock)
+    answers = LiveAnswers(MONITOR, RULES, source, notices, kept, clock=clock)
     heard, passed_on = [], []
     answers.heard = lambda live: heard.append(live.figures)
     answers.passed_on = lambda answer, middle_ns: passed_on.append((answer.raw, middle_ns))
@@ -151,7 +129,7 @@ def test_answers_are_judged_recorded_and_told_beside_the_frames():
 @pytest.mark.parametrize("changed", [OnScreen(operator="grid"), OnScreen(hidden="minimised")])
 def test_frames_that_an_operator_changed_or_a_window_hides_are_no_sky_to_compare_with(changed):
     source = Queued()
-    answers = LiveAnswers(BENCH, RULES, source, Notices(), Kept(), clock=FakeClock(NS_PER_S))
+    answers = LiveAnswers(MONITOR, RULES, source, Notices(), Kept(), clock=FakeClock(NS_PER_S))
     second_of_frames(answers, on_screen=changed)
     source.waiting.append(Answer(NS_PER_S // 2, b"", NS_PER_S // 2, Q))
     with answers.running():
@@ -161,7 +139,7 @@ def test_frames_that_an_operator_changed_or_a_window_hides_are_no_sky_to_compare
 
 def test_a_flood_of_answers_is_judged_up_to_a_rate_and_counted_beyond():
     source, kept, clock = Queued(), Kept(), FakeClock(2 * NS_PER_S)
-    answers = LiveAnswers(BENCH, RULES, source, Notices(), kept, clock=clock)
+    answers = LiveAnswers(MONITOR, RULES, source, Notices(), kept, clock=clock)
     second_of_frames(answers)
     source.waiting.extend(Answer(NS_PER_S + k, b"", NS_PER_S // 2, Q) for k in range(5000))
     with answers.running():
@@ -174,7 +152,7 @@ def test_a_flood_of_answers_is_judged_up_to_a_rate_and_counted_beyond():
 
 def test_a_source_that_fails_ends_neither_the_run_nor_what_comes_after():
     source, notices, kept = Queued(), Notices(), Kept()
-    answers = LiveAnswers(BENCH, RULES, source, notices, kept, clock=FakeClock(NS_PER_S))
+    answers = LiveAnswers(MONITOR, RULES, source, notices, kept, clock=FakeClock(NS_PER_S))
     second_of_frames(answers)
     source.waiting.append(Answer(NS_PER_S // 2, b"\x07", NS_PER_S // 2, np.ones(3)))
     source.waiting.append(Answer(NS_PER_S // 2, b"", NS_PER_S // 2, Q))
@@ -191,7 +169,7 @@ def test_a_source_that_fails_ends_neither_the_run_nor_what_comes_after():
 
 def test_a_reader_that_does_not_read_is_told_in_the_tracker_s_place():
     source, notices, clock = Queued(), Notices(), FakeClock(NS_PER_S)
-    answers = LiveAnswers(BENCH, RULES, source, notices, Kept(), clock=clock)
+    answers = LiveAnswers(MONITOR, RULES, source, notices, Kept(), clock=clock)
 
     def told(words: str) -> bool:
         clock.work(NS_PER_S // 5)
@@ -210,34 +188,29 @@ def test_a_valid_answer_is_passed_on_with_the_stamp_of_the_sender_s_own_clock():
     """A sender whose clock is 7 s behind the host's. An answer without an attitude, or before that
     clock is known, is not passed on.
     """
-    sent = []
-    receiver = SimpleNamespace(
-        clock_summary=lambda: SimpleNamespace(offset_ms=7000.0),
-        back=SimpleNamespace(pass_on=sent.append),
-    )
     answer = Answer(20 * NS_PER_S, b"", None, np.array([1.0, 0.0, 0.0, 0.0]))
-    serve._pass_on(receiver, iter([5]), answer, 12 * NS_PER_S)
     q, still = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    assert sent == [AnswerPacket(5, protocol.ANSWER_VALID, 5 * NS_PER_S, q, still, 0)]
+    assert serve.answer_packet(answer, 12 * NS_PER_S, 7000.0) == AnswerPacket(
+        0, protocol.ANSWER_VALID, 5 * NS_PER_S, q, still, 0
+    )
     turning = replace(answer, rate_cam_rad_s=np.array([0.1, -0.2, 0.3]), star_count=9)
-    serve._pass_on(receiver, iter([6]), turning, 13 * NS_PER_S)
     flags = protocol.ANSWER_VALID | protocol.ANSWER_RATE_VALID
-    assert sent.pop() == AnswerPacket(6, flags, 6 * NS_PER_S, q, (0.1, -0.2, 0.3), 9)
-    invalid = replace(answer, valid=False)
-    without_attitude = replace(answer, q_icrs_to_cam=None)
-    for other in (invalid, without_attitude):
-        serve._pass_on(receiver, iter([6]), other, 12 * NS_PER_S)
-    receiver.clock_summary = lambda: SimpleNamespace(offset_ms=None)
-    serve._pass_on(receiver, iter([6]), answer, 12 * NS_PER_S)
-    assert len(sent) == 1
+    assert serve.answer_packet(turning, 13 * NS_PER_S, 7000.0) == AnswerPacket(
+        0, flags, 6 * NS_PER_S, q, (0.1, -0.2, 0.3), 9
+    )
+    for other in (replace(answer, valid=False), replace(answer, q_icrs_to_cam=None)):
+        assert serve.answer_packet(other, 12 * NS_PER_S, 7000.0) is None
+    assert serve.answer_packet(answer, 12 * NS_PER_S, None) is None
 
 
 def test_a_frame_is_lit_a_swap_s_delay_after_its_swap_on_a_screen_and_else_at_its_moment():
     shown = Shown(0, 1000, Attitude(Q, 0, False), DRAWN, draw_ns=1000, swap_ns=3000)
     lit = []
-    for screen in (SimpleNamespace(swap_to_light_ns=700), None):
+    for delay_ns in (700, None):
         answers = LiveAnswers(
-            *(BENCH, RULES, Queued(), Notices(), Kept()), screen=screen, clock=FakeClock(NS_PER_S)
+            *(MONITOR, RULES, Queued(), Notices(), Kept()),
+            swap_to_light_ns=delay_ns,
+            clock=FakeClock(NS_PER_S),
         )
         answers.frame(shown, 1005)
         newest = answers._frames.newest
@@ -246,22 +219,19 @@ def test_a_frame_is_lit_a_swap_s_delay_after_its_swap_on_a_screen_and_else_at_it
     assert lit == [(3700, 1005), (1000, 1005)]
 
 
-def judged(residual_arcsec: tuple[float, float, float]) -> SimpleNamespace:
+def judged(*residual_arcsec: float) -> Judged:
     """An answer that was wrong, and came 250 ms after its frames."""
-    return SimpleNamespace(
-        residual=residual_arcsec,
-        lit=SimpleNamespace(first=7, last=9),
-        middle_ns=NS_PER_S,
-        answer=SimpleNamespace(host_ns=NS_PER_S + 250 * NS_PER_MS),
-    )
+    answer = Answer(NS_PER_S + 250 * NS_PER_MS, b"", None, Q)
+    lit = Lit(Q, np.zeros(3), NS_PER_S, first=7, last=9)
+    return Judged(answer, "wrong", NS_PER_S, 0.0, lit, np.array(residual_arcsec))
 
 
 def test_a_wrong_answer_is_off_by_arcsec_or_by_degrees_as_a_person_reads_it():
-    assert wrong_line(judged((300.0, 0.0, -400.0))) == (
+    assert wrong_line(judged(300.0, 0.0, -400.0)) == (
         "the tracker's answer is off by 500 arcsec (x 300, y 0, z -400) in frames 7 to 9,"
         " 250 ms ago"
     )
-    assert wrong_line(judged((10_800.0, 0.0, -14_400.0))) == (
+    assert wrong_line(judged(10_800.0, 0.0, -14_400.0)) == (
         "the tracker's answer is off by 5.00 deg (x 3.00, y 0.00, z -4.00) in frames 7 to 9,"
         " 250 ms ago"
     )

@@ -30,7 +30,6 @@ from hilstar.server.replay import (
 )
 from hilstar.server.serve import Outlet
 from tests.support.benches import SMALL_BENCH
-from tests.support.ledgers import kept_bench
 from tests.support.refusals import refusal
 
 MAX = math.inf
@@ -63,15 +62,15 @@ def log_in_ms(roll_log):
 
 
 @pytest.fixture
-def first_run(tmp_path, small_bench_file):
-    return earlier_run(tmp_path / "run.mcap", small_bench_file)
+def first_run(tmp_path, small_bench):
+    return earlier_run(tmp_path / "run.mcap", small_bench)
 
 
-def earlier_run(path, small_bench_file, speed_km_s=0.0, away_km=0.0):
+def earlier_run(path, bench, speed_km_s=0.0, away_km=0.0):
     """Ten frames, one each 20 ms, the fourth of them blank, the last four aberrated, the last
     two on paths.
     """
-    with Ledger(path, kept_bench(small_bench_file)) as kept:
+    with Ledger(path, bench) as kept:
         for k in range(10):
             sample = AttitudeSample(k, np.array([1.0, 0.0, 0.0, 0.0]), None, k)
             kept.packet(1000 + k, encode(sample), sample, None)
@@ -236,18 +235,20 @@ def test_a_part_of_an_earlier_run_is_chosen_by_when_its_frames_were_swapped(firs
     ],
 )
 def test_a_path_is_there_again_and_no_other_than_a_spacecraft_s(
-    first_run, config, tmp_path, small_bench_file, name, kept, planted, words
+    first_run, config, tmp_path, small_bench, name, kept, planted, words
 ):
     play = plan_play(first_run, Wanted(speed=MAX), config)
     before, after = (getattr(play.frame(number)[2], name) for number in (5, 6))
     assert before is None and after.tolist() == kept
-    wrong = earlier_run(tmp_path / "wrong.mcap", small_bench_file, **planted)
+    wrong = earlier_run(tmp_path / "wrong.mcap", small_bench, **planted)
     with pytest.raises(InputError, match=f"message 7 of /frame: {words}"):
         plan_play(wrong, Wanted(speed=MAX), config)
 
 
-def test_a_ledger_says_who_drew_it_and_a_log_does_not(first_run, roll_log, config):
-    assert plan_play(first_run, Wanted(MAX), config).drawn_by == DrawnBy("none", "none", "NumPy")
+def test_a_ledger_says_who_drew_it_and_a_log_does_not(first_run, roll_log, config, small_bench):
+    own = small_bench.renderer
+    drawn_by = DrawnBy(own.gl_renderer, own.gl_version, own.path)
+    assert plan_play(first_run, Wanted(MAX), config).drawn_by == drawn_by
     assert plan_play(roll_log, Wanted(MAX), config).drawn_by is None
 
 

@@ -2,53 +2,35 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import msgspec
 import numpy as np
 import pytest
 
-from hilstar.attitude.clock.timeline import Attitude, StaleGate
+from hilstar.attitude.clock.timeline import Attitude
 from hilstar.attitude.receiver import PacketCounts, Traffic
 from hilstar.attitude.wire import protocol
 from hilstar.basics.notices import Notices
 from hilstar.server.bench.config import AttitudeSettings
-from hilstar.server.operator import OnScreen
+from hilstar.server.operator import Aids, Operator
 from hilstar.server.pacer import Shown
+from hilstar.server.record.ledger import Ledger
+from hilstar.server.replay import DrawnBy
 from hilstar.server.serve import StatusMaker, traffic_of
 from hilstar.server.summary import RunTally, SwapTally
+from tests.support.drawn import drawn
 
 FRESH = Attitude(np.array([1.0, 0.0, 0.0, 0.0]), 5_000_000, False, sequence=42)
 MS = 1_000_000
 
 
-class Keys:
-    """An operator, and a window, as a test sets them."""
-
-    def __init__(self) -> None:
-        self.now = OnScreen()
-
-    def look(self) -> OnScreen:
-        return self.now
-
-
-@pytest.fixture
-def loop():
-    return SimpleNamespace(
-        tally=RunTally(),
-        gate=StaleGate(250 * MS),
-        notices=Notices(),
-        pacer=SimpleNamespace(operator=Keys()),
-    )
-
-
-RENDERER = SimpleNamespace(gl_renderer="llvmpipe", gl_version="4.5", path="points")
+RENDERER = DrawnBy("llvmpipe", "4.5", "points")
+BLACK = np.zeros((3, 4), np.uint8)
 
 
 def shown_frame(
     attitude: Attitude | None = FRESH, number: int = 9, clipped: tuple[int, ...] = (), **more
 ) -> Shown:
-    return Shown(number, 0, attitude, SimpleNamespace(clipped_hip=clipped), **more)
+    return Shown(number, 0, attitude, drawn(BLACK, clipped_hip=clipped), **more)
 
 
 def test_a_status_names_the_frame_its_light_and_the_attitude_behind_it(loop):
@@ -104,32 +86,29 @@ def test_missed_frames_and_refused_packets_are_told_once_each_time(loop):
     assert maker.status(shown_frame(), 0, loop, counts, False).health == protocol.HEALTH_MISSED
 
 
-@pytest.mark.parametrize(
-    ("on_screen", "bit"),
-    [
-        (OnScreen(operator="grid"), protocol.HEALTH_OPERATOR_OVERRIDE),
-        (OnScreen(hidden="minimised"), protocol.HEALTH_HIDDEN),
-    ],
-)
-def test_an_operator_s_keys_and_a_hidden_window_are_told_while_they_last(loop, on_screen, bit):
+def test_an_operator_s_keys_and_a_hidden_window_are_told_while_they_last(loop):
     maker = StatusMaker()
-    loop.pacer.operator.now = on_screen
-    assert [
-        maker.status(shown_frame(), 0, loop, PacketCounts(), False).health for _ in range(2)
-    ] == [
-        bit,
-        bit,
-    ]
+
+    def health() -> int:
+        return maker.status(shown_frame(), 0, loop, PacketCounts(), False).health
+
+    loop.pacer.operator.aids.toggle("grid")
+    assert [health(), health()] == [protocol.HEALTH_OPERATOR_OVERRIDE] * 2
+    loop.pacer.operator = Operator(Aids(), Notices(), lambda: "minimised")
+    assert [health(), health()] == [protocol.HEALTH_HIDDEN] * 2
 
 
-def test_a_failed_ledger_a_clipped_star_and_a_stale_attitude_are_told_while_they_last(loop):
-    ledger = SimpleNamespace(failure=None)
-    maker = StatusMaker(ledger)
-    assert maker.status(shown_frame(), 0, loop, PacketCounts(), False).health == 0
-    ledger.failure, loop.gate.stale = "No space left on device", True
-    bits = protocol.HEALTH_LEDGER_FAILED | protocol.HEALTH_CLIPPED | protocol.HEALTH_STALE
-    assert (
-        maker.status(shown_frame(clipped=(32349,)), 0, loop, PacketCounts(), False).health == bits
+def test_a_failed_ledger_a_clipped_star_and_a_stale_attitude_are_told_while_they_last(
+    loop, small_bench, tmp_path
+):
+    with Ledger(tmp_path / "run.mcap", small_bench) as ledger:
+        maker = StatusMaker(ledger)
+        assert maker.status(shown_frame(), 0, loop, PacketCounts(), False).health == 0
+        ledger.failure, loop.gate.stale = "No space left on device", True
+        clips = shown_frame(clipped=(32349,))
+        health = maker.status(clips, 0, loop, PacketCounts(), False).health
+    assert health == (
+        protocol.HEALTH_LEDGER_FAILED | protocol.HEALTH_CLIPPED | protocol.HEALTH_STALE
     )
 
 

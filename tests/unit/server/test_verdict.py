@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import pytest
 from msgspec.structs import replace
 
 from hilstar.attitude.receiver import PacketCounts
 from hilstar.basics.wrong_sky import ConditionTotal, WrongSkyTotal
+from hilstar.server.replay import DrawnBy
 from hilstar.server.summary import RunSummary, RunTally, verdict_of
 
-RENDERER = SimpleNamespace(gl_renderer="llvmpipe", gl_version="4.5", path="points")
+RENDERER = DrawnBy("llvmpipe", "4.5", "points")
 
 
 @pytest.fixture

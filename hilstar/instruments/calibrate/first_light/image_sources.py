@@ -569,6 +569,24 @@ class GrabCommand(_ShownHere):
         return output
 
 
+class BlackImages:
+    """Tells the first image that is 0 everywhere, of a lit pattern and of a black one."""
+
+    def __init__(self) -> None:
+        self._told_black: set[bool] = set()
+
+    def tell(self, dn: CodeImage, name: str, *, lit: bool) -> None:
+        """Take in an image (h, w), DN, of a pattern that is lit or not."""
+        if dn.any() or lit in self._told_black:
+            return
+        self._told_black.add(lit)
+        if lit:
+            advice = "look at the lens cap, the exposure and the camera's black level"
+        else:
+            advice = "a black level above 0 would show the noise of dark pixels"
+        log.warning("%s: every pixel is 0; %s", name, advice)
+
+
 class GrabCamera(_ShownHere):
     """Images of a GenICam camera (see `server.genicam`), set as `[tracker.camera]` says.
 
@@ -588,7 +606,7 @@ class GrabCamera(_ShownHere):
         super().__init__(dark, diode)
         tracker = file.config.tracker
         self.identity = f"grab: {PREFIX}{name}"
-        self._told_black: set[bool] = set()
+        self._black_images = BlackImages()
         self._camera = GenicamCamera(name)
         try:
             about = self._camera.about
@@ -605,7 +623,7 @@ class GrabCamera(_ShownHere):
         image = self._taken(
             stem.name, exposure_s, lambda done: self._display.show_until(file, pattern, done)
         )
-        self._tell_black(image, stem.name, lit=any(codes.any() for codes in pattern.frames))
+        self._black_images.tell(image.dn, stem.name, lit=any(map(np.any, pattern.frames)))
         path = stem.with_name(stem.name + ".png")
         picture = png_of(image.dn)
         written(path, lambda output: output.write(picture))
@@ -614,7 +632,7 @@ class GrabCamera(_ShownHere):
     def photograph(self, stem: Path, exposure_s: float) -> Path:
         """The camera's image as FITS, with its exposure and when it began. Raises NoImage."""
         image = self._taken(stem.name, exposure_s, _wait)
-        self._tell_black(image, stem.name, lit=True)
+        self._black_images.tell(image.dn, stem.name, lit=True)
         path = stem.with_name(stem.name + ".fits")
         write_photograph(path, image)
         return path
@@ -652,17 +670,6 @@ class GrabCamera(_ShownHere):
         if image.incomplete:
             log.warning("%s: taken again after %d incomplete images", name, image.incomplete)
         return image
-
-    def _tell_black(self, image: CameraImage, name: str, *, lit: bool) -> None:
-        """Tell the first image that is 0 everywhere, of a lit pattern and of a black one."""
-        if image.dn.any() or lit in self._told_black:
-            return
-        self._told_black.add(lit)
-        if lit:
-            advice = "look at the lens cap, the exposure and the camera's black level"
-        else:
-            advice = "a black level above 0 would show the noise of dark pixels"
-        log.warning("%s: every pixel is 0; %s", name, advice)
 
     def close(self) -> None:
         """Close the display and let the camera go."""

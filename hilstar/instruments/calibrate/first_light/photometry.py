@@ -95,7 +95,7 @@ def photometry(context: StepContext) -> StepOutcome:
     if errors is not None:
         black_error = errors.black
     responses = (assumed.response, now)
-    figures = _response_figures(context, readings, calibration, responses, black_error)
+    figures = _response_figures(context.truth, readings, calibration, responses, black_error)
     if written.weights is not None:
         shares = []
         for name, share in zip(channels, written.weights, strict=True):
@@ -174,7 +174,7 @@ def shares_of_white(file: BenchFile) -> FloatArray:
 
 
 def _response_figures(
-    context: StepContext,
+    truth: BenchFile | None,
     readings: Readings,
     found: dict[str, Any],
     responses: tuple[Response, Response],
@@ -225,8 +225,8 @@ def _response_figures(
     }
     for decade, value in found["error_percent"].items():
         figures[f"error_at_{decade}_percent"] = value
-    if context.truth is not None:
-        true = bench_calibration(context.truth.config, context.truth.folder).response
+    if truth is not None:
+        true = bench_calibration(truth.config, truth.folder).response
         figures["truth_max_mag"] = float(np.abs(response_error_mag(now, true)).max())
         figures["truth_black_level"] = true.black
     return figures

@@ -8,6 +8,7 @@ light is that of photons, background and PRNU.
 
 import dataclasses
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,16 +19,21 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 from scipy.special import ndtr
 
-from hilstar.basics.arrays import FloatArray
+from hilstar.basics.arrays import Float32Array, FloatArray, IntArray
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_matrix, random_attitudes, to_matrix
 from hilstar.basics.units import MAG_PER_RELATIVE, magnitude
 from hilstar.display.panel import Panel
 from hilstar.display.quantise import shown_light
 from hilstar.display.response import Levels
-from hilstar.instruments.calibrate.first_light.context import MAX_FILL, StepContext
+from hilstar.instruments.calibrate.first_light.context import (
+    MAX_FILL,
+    DarkSubtracted,
+    StepContext,
+)
 from hilstar.instruments.calibrate.first_light.image_sources import CodeImage, Pattern
 from hilstar.instruments.calibrate.scale import STAR_MAG
+from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.optics.camera import Camera
 from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.cameras import display_psf, tracker_camera
@@ -134,6 +140,11 @@ class StarSpot:
         in_next_column = beside[:, 0] * inside[:, 1]
         in_next_row = inside[:, 0] * beside[:, 1]
         return np.asarray(np.maximum(in_next_column, in_next_row))
+
+    def reach_on_screen(self, geometry: BenchGeometry) -> int:
+        """Half the side of the window on the screen, without its middle, monitor pixels."""
+        ratio = geometry.monitor.focal_length_px / geometry.tracker.focal_length_px
+        return math.ceil((self.radius_px + 0.5) * ratio)
 
     def _share_within(self, half_px: float) -> float:
         """The share of a star's light in a square about it."""
@@ -383,7 +394,7 @@ def see_stars(context: StepContext, frames: int = 1) -> StarsSeen:
     """
     spot = StarSpot.of(context)
     dark, dark_paths = _mean_dark(context, frames)
-    shown = _shown_fields(context, spot, math.sqrt(2) * noisiest_background(dark).noise)
+    shown = _shown_fields(context, spot, difference_noise_dn(dark))
     fields = []
     for number, field in enumerate(shown):
         patterns = []
@@ -392,7 +403,9 @@ def see_stars(context: StepContext, frames: int = 1) -> StarsSeen:
             if again:
                 name += f"_{again:02}"
             patterns.append(Pattern(name, field.codes[0], field.codes[1:]))
-        fields.append(_compared(context, patterns, dark, field.expected, spot))
+        looked = (context.look(pattern, dark) for pattern in patterns)
+        limits = ImageLimits(context.exposure_s, context.full_dn)
+        fields.append(compared(looked, field.expected, spot, limits))
     columns: dict[str, Any] = {}
     for column in dataclasses.fields(StarsSeen):
         if column.name not in {"lost", "frames", "images"}:
@@ -406,6 +419,11 @@ def see_stars(context: StepContext, frames: int = 1) -> StarsSeen:
     if len(stars_seen.dn) < MIN_STARS:
         raise InputError(_why_few(stars_seen, spot, len(shown)))
     return stars_seen
+
+
+def difference_noise_dn(dark: FloatArray) -> float:
+    """The noise of a pixel of an image less a dark one (h, w) that is as noisy, DN."""
+    return math.sqrt(2) * noisiest_background(dark).noise
 
 
 def _shown_fields(context: StepContext, spot: StarSpot, noise_dn: float) -> list[_ShownField]:
@@ -423,7 +441,7 @@ def _shown_fields(context: StepContext, spot: StarSpot, noise_dn: float) -> list
                     drawn = bench.draw(frame.q_icrs_to_cam, number)
                     levels.append(Levels(drawn.levels.copy()))
             codes = [bench.code_values(of_frame).astype(np.uint16) for of_frame in levels]
-            expected = _alone(bench, context, frame, tuple(levels), spot)
+            expected = _alone(bench, context, frame, levels, spot)
             shown.append(_ShownField(tuple(codes), expected))
     return shown
 
@@ -515,7 +533,7 @@ def _is_in_image(camera: Camera, in_cam: FloatArray, margin_px: float) -> npt.ND
 
 
 def _alone(
-    bench: Bench, context: StepContext, frame: Frame, levels: tuple[Levels, ...], spot: StarSpot
+    bench: Bench, context: StepContext, frame: Frame, levels: Sequence[Levels], spot: StarSpot
 ) -> ExpectedStars:
     """The isolated stars of a frame that are drawn whole, with their expected places in the
     tracker's image.
@@ -525,28 +543,52 @@ def _alone(
     vectors = bench.stars.directions(frame.star)
     in_cam = vectors @ to_matrix(frame.q_icrs_to_cam).T
     place = np.stack(camera.project(in_cam), axis=1)
+    sizes_px = (camera.resolution_px, context.resolution_px)
+    is_usable = stars_alone(truth, bench.stars.row[frame.star], place, sizes_px, spot)
+    screen = np.stack([truth["x_px"], truth["y_px"]], axis=1)[is_usable]
+    reach = spot.reach_on_screen(context.geometry())
+    return ExpectedStars(
+        hip=truth["hip"][is_usable],
+        place_px=place[is_usable],
+        e_per_s=np.asarray(truth["electrons_per_s"][is_usable], dtype=np.float64),
+        screen=from_middle(screen, context.resolution_px),
+        codes_mag=codes_mag(frame.linear, levels, bench.panel, screen, reach),
+    )
+
+
+def from_middle(screen_px: FloatArray, resolution_px: tuple[int, int]) -> FloatArray:
+    """Places on the screen (n, 2) from its middle, -1 to 1 along each axis."""
+    middle = (np.array(resolution_px) - 1) / 2
+    return np.asarray((screen_px - middle) / middle)
+
+
+def stars_alone(
+    truth: npt.NDArray[np.void],
+    catalogue_row: IntArray,
+    place: FloatArray,
+    sizes_px: tuple[tuple[int, int], tuple[int, int]],
+    spot: StarSpot,
+) -> npt.NDArray[np.bool_]:
+    """Which stars of a frame (n,), of TRUTH_DTYPE, at places in the tracker's image (n, 2) are
+    drawn whole, within the edges of tracker and screen, of these sizes, and beside no others.
+
+    Planets have a row of -1 in the catalogue.
+    """
+    tracker_px, screen_px = sizes_px
     screen = np.stack([truth["x_px"], truth["y_px"]], axis=1)
     light = np.asarray(truth["electrons_per_s"], dtype=np.float64)
     edge_px = max(MIN_EDGE_PX, spot.radius_px + 2.0)
     is_usable = truth["drawn"] & ~truth["clipped"] & np.isfinite(place).all(axis=1)
     # No planets: their light is known to 0.05 mag only, and a disc may be wide.
-    is_usable &= bench.stars.row[frame.star] >= 0
-    is_usable &= _is_inside(place, camera.resolution_px, edge_px)
-    is_usable &= _is_inside(screen, context.resolution_px, MIN_EDGE_PX)
+    is_usable &= catalogue_row >= 0
+    is_usable &= _is_inside(place, tracker_px, edge_px)
+    is_usable &= _is_inside(screen, screen_px, MIN_EDGE_PX)
     finite = np.where(np.isfinite(place), place, -1e6)
     near = cKDTree(finite).query_ball_point(finite, ALONE_RADII * spot.radius_px + 2)
     beside = light.copy()
     for k in range(len(light)):
         beside[k] = light[near[k]].sum() - light[k]
-    is_usable &= beside < BESIDE_SHARE * light
-    middle = (np.array(context.resolution_px) - 1) / 2
-    return ExpectedStars(
-        hip=truth["hip"][is_usable],
-        place_px=place[is_usable],
-        e_per_s=light[is_usable],
-        screen=(screen[is_usable] - middle) / middle,
-        codes_mag=_codes_mag(bench, context, frame, levels, screen[is_usable], spot),
-    )
+    return np.asarray(is_usable & (beside < BESIDE_SHARE * light))
 
 
 def _is_inside(
@@ -558,28 +600,25 @@ def _is_inside(
     return np.asarray(is_inside.all(axis=1))
 
 
-def _codes_mag(
-    bench: Bench,
-    context: StepContext,
-    frame: Frame,
-    levels: tuple[Levels, ...],
+def codes_mag(
+    linear: Float32Array,
+    levels: Sequence[Levels],
+    panel: Panel,
     screen_px: FloatArray,
-    spot: StarSpot,
+    reach: int,
 ) -> FloatArray:
-    """How much fainter the codes are than the light asked for (n,), magnitudes, within the
-    tracker's window.
+    """How much fainter a panel's levels, in the mean of frames, are than the light asked for (h, w)
+    about places on the screen (n, 2), magnitudes (n,): in windows that reach so many pixels to
+    each side.
     """
-    geometry = context.geometry()
-    ratio = geometry.monitor.focal_length_px / geometry.tracker.focal_length_px
-    reach = math.ceil((spot.radius_px + 0.5) * ratio)
     off_mag = []
     for x, y in np.rint(screen_px).astype(np.intp):
         rows = slice(max(y - reach, 0), y + reach + 1)
         columns = slice(max(x - reach, 0), x + reach + 1)
         part = (rows, columns)
-        wanted = float(frame.linear[part].sum(dtype=np.float64))
+        wanted = float(linear[part].sum(dtype=np.float64))
         # In the window alone: light of a whole 8K screen is 0.3 GB, and here were three of them.
-        shown = np.mean([_light_in(of_frame, bench.panel, part) for of_frame in levels])
+        shown = np.mean([_light_in(of_frame, panel, part) for of_frame in levels])
         if wanted > 0:
             off_mag.append(magnitude(float(shown) / wanted))
         else:
@@ -593,21 +632,23 @@ def _light_in(levels: Levels, panel: Panel, part: tuple[slice, slice]) -> float:
     return float(shown_light(Levels(levels[part]), panel.in_part(part)).sum())
 
 
-def _compared(
-    context: StepContext,
-    patterns: list[Pattern],
-    dark: FloatArray,
-    wanted: ExpectedStars,
-    spot: StarSpot,
+class ImageLimits(NamedTuple):
+    """The exposure of an image, and the level at which the tracker saturates."""
+
+    exposure_s: float
+    full_dn: float
+
+
+def compared(
+    looked: Iterator[DarkSubtracted], wanted: ExpectedStars, spot: StarSpot, limits: ImageLimits
 ) -> StarsSeen:
     """The stars found in the mean of a field's images, against those that should be there."""
-    first = context.look(patterns[0], dark)
+    first = next(looked)
     paths = [first.path]
     total = first.image
-    for pattern in patterns[1:]:
-        looked = context.look(pattern, dark)
-        paths.append(looked.path)
-        total = total + looked.image
+    for another in looked:
+        paths.append(another.path)
+        total = total + another.image
     images = len(paths)
     image = total / images
     background = noisiest_background(image, 1 / images)
@@ -623,7 +664,7 @@ def _compared(
         nearest = np.asarray(rows)
     near = distance_px < max(MIN_REACH_PX, spot.mean_sigma_px)
     near_dn = stars.flux[nearest[near]] / spot.window_share
-    expected_dn = wanted.e_per_s * context.exposure_s / spot.gain_e_per_dn
+    expected_dn = wanted.e_per_s * limits.exposure_s / spot.gain_e_per_dn
     brighter = 1.0
     if near.sum() >= MIN_STARS:  # the screen may give more or less light than the bench file says
         brighter = float(np.median(near_dn / expected_dn[near]))
@@ -640,7 +681,7 @@ def _compared(
     window_dn = np.maximum(dn * spot.window_share, 1e-9)
     rounded = shared.rounded_dn(dn, noise_dn) / window_dn[:, None]
     residual_px = places_px[chosen] - wanted.place_px[matched]
-    saturated = stars.peak[chosen] > MAX_FILL * context.full_dn - first.floor_dn
+    saturated = stars.peak[chosen] > MAX_FILL * limits.full_dn - first.floor_dn
     noise_mag = np.where(saturated, np.inf, noise_mag)
     return StarsSeen(
         hip=wanted.hip[matched],

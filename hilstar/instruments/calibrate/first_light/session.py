@@ -9,10 +9,10 @@ import os
 import platform
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Set
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -204,6 +204,25 @@ RUNS: dict[str, Callable[[StepContext], StepOutcome]] = {
 }
 
 
+class SessionPlan(NamedTuple):
+    """The steps of a session in their order, and what runs each."""
+
+    steps: tuple[SessionStep, ...] = STEPS
+    runs: Mapping[str, Callable[[StepContext], StepOutcome]] = RUNS
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The steps' names, in their order."""
+        return tuple(step.name for step in self.steps)
+
+    def later_keys(self, number: int) -> frozenset[str]:
+        """The keys of the bench file, as table.key, that the steps after one may set."""
+        return frozenset(key for other in self.steps[number + 1 :] for key in other.writes)
+
+
+FIRST_LIGHT = SessionPlan()
+
+
 class Progress:
     """Tells every PROGRESS_S what a step is at, from a thread of its own: a fit takes as long as
     an image.
@@ -244,6 +263,41 @@ class Progress:
             thread.join()
 
 
+def origin_of(source: ImageSource) -> str:
+    """What takes the images, and the monitor that shows the patterns where its EDID tells it."""
+    monitor = source.monitor
+    if monitor is None or not monitor.edid_sha256:
+        return source.identity
+    return f"{source.identity} on {monitor.name()}"
+
+
+def state_sha256(
+    step: SessionStep,
+    later: Set[str],
+    config: Mapping[str, Mapping[str, Any]],
+    folder: Path,
+    source: str,
+    tables: tuple[str, ...] = (),
+) -> str:
+    """The SHA-256 of what a step depends on: its tables (or these) of a bench file in `folder`,
+    without later steps' keys, the files that they name, and the source of its images.
+    """
+    keys_by_table = {}
+    for table in tables or step.tables:
+        keys_by_table[table] = {
+            key: value for key, value in config[table].items() if f"{table}.{key}" not in later
+        }
+    named = {}
+    for text in _texts(keys_by_table):
+        if _is_file(folder / text):
+            named[text] = sha256_of(folder / text)
+    # a step without tables shows nothing
+    origin = source if step.tables else platform.python_version()
+    return hashlib.sha256(
+        msgspec.json.encode([__version__, origin, keys_by_table, named], order="sorted")
+    ).hexdigest()
+
+
 class FirstLightSession:
     """A session in a directory, with at most `patches` readings of the response; `watch` is called
     with each pattern.
@@ -265,7 +319,9 @@ class FirstLightSession:
         watched_s: float = 0.0,
         frames: int = 0,
         progress: Callable[[str], object] = lambda line: None,
+        plan: SessionPlan = FIRST_LIGHT,
     ) -> None:
+        self._plan = plan
         self._watch = watch
         self._watched_s = watched_s
         self._frames = frames
@@ -287,7 +343,7 @@ class FirstLightSession:
             self.unfinished |= earlier.unfinished
             for record in earlier.steps:
                 # a step of another version of hilstar is none of this session's
-                if record.name in NAMES:
+                if record.name in plan.names:
                     self.records[record.name] = record
 
     def run(self, again: frozenset[str], say: Callable[[str], None]) -> int:
@@ -298,7 +354,7 @@ class FirstLightSession:
         before = self.folder / BEFORE_FILE
         if not before.exists():
             write_whole(before, self.file.path.read_bytes())
-        for number, step in enumerate(STEPS):
+        for number, step in enumerate(self._plan.steps):
             if step.name not in again and self._is_done(number):
                 record = self.records[step.name]
                 say(f"{step.name:12} {record.verdict} before: {record.line}")
@@ -313,7 +369,7 @@ class FirstLightSession:
         """Whether a step need not run: it is done, or skipped for good, and nothing it depends
         on has changed.
         """
-        step = STEPS[number]
+        step = self._plan.steps[number]
         record = self.records.get(step.name)
         if record is None or record.verdict == "failed" or step.name in self.unfinished:
             return False
@@ -346,7 +402,7 @@ class FirstLightSession:
 
     def _run(self, number: int, afresh: bool, say: Callable[[str], None]) -> StepRecord:
         """Run a step, or skip it for want of another; its record."""
-        step = STEPS[number]
+        step = self._plan.steps[number]
         start_s = time.monotonic()
         exit_code = 0
         unmet = self._unmet(step)
@@ -385,7 +441,7 @@ class FirstLightSession:
         """A step's outcome, and its exit code; a failure where it raises. Raises Stopped."""
         try:
             with self._progress.of(step.name):
-                outcome = RUNS[step.name](context).checked()
+                outcome = self._plan.runs[step.name](context).checked()
             self.file = rewrite(self.file, outcome.changes)
         except Stopped:
             raise
@@ -404,7 +460,7 @@ class FirstLightSession:
     def _attempt(self, number: int) -> str:
         """What an attempt's images depend on."""
         # Every pattern depends on the collimator, even where the step's result does not.
-        tables = (*STEPS[number].tables, "collimator")
+        tables = (*self._plan.steps[number].tables, "collimator")
         return f"{self._state(number, tables)} {self.patches}"
 
     def _context(self, step: SessionStep, goes_on: bool) -> StepContext:
@@ -438,33 +494,12 @@ class FirstLightSession:
         self._watch(pattern)
 
     def _state(self, number: int, tables: tuple[str, ...] = ()) -> str:
-        """The SHA-256 of what a step depends on: its tables without later steps' keys, files
-        they name, the source.
-        """
-        step = STEPS[number]
-        later = {key for other in STEPS[number + 1 :] for key in other.writes}
+        """The state of a step of this session."""
+        step = self._plan.steps[number]
+        later = self._plan.later_keys(number)
         config = msgspec.to_builtins(self.file.config)
-        keys_by_table = {}
-        for table in tables or step.tables:
-            keys_by_table[table] = {
-                key: value for key, value in config[table].items() if f"{table}.{key}" not in later
-            }
-        named = {}
-        for text in _texts(keys_by_table):
-            if _is_file(self.file.folder / text):
-                named[text] = sha256_of(self.file.folder / text)
-        monitor = self.source.monitor
-        if monitor is not None and monitor.edid_sha256:
-            shown_on = f" on {monitor.name()}"
-        else:
-            shown_on = ""
-        if step.tables:
-            seen_by = self.source.identity + shown_on
-        else:
-            seen_by = platform.python_version()
-        return hashlib.sha256(
-            msgspec.json.encode([__version__, seen_by, keys_by_table, named], order="sorted")
-        ).hexdigest()
+        source = origin_of(self.source)
+        return state_sha256(step, later, config, self.file.folder, source, tables)
 
     def as_file(self, running: str | None = None) -> SessionFile:
         """The contents of session.json."""
@@ -475,7 +510,7 @@ class FirstLightSession:
             bench_sha256=self.file.sha256,
             seen_by=self.source.identity,
             running=running,
-            steps=[self.records[name] for name in NAMES if name in self.records],
+            steps=[self.records[name] for name in self._plan.names if name in self.records],
             unfinished=self.unfinished,
             beat=self.beat(),
             forced=list(self.source.forced),

@@ -4,12 +4,13 @@ twin.
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from msgspec.structs import replace
 
-from hilstar.basics.arrays import BoolArray, FloatArray
+from hilstar.basics.arrays import FloatArray
 from hilstar.basics.charts import BLUE, INK, MUTED, SMALL_PT, chart, write_csv
 from hilstar.basics.errors import InputError
 from hilstar.basics.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, magnitude
@@ -29,6 +30,7 @@ from hilstar.instruments.calibrate.first_light.seen_stars import (
     see_stars,
 )
 from hilstar.instruments.calibrate.scale import UNSURE_MAG, MeasuredScale, scale_of
+from hilstar.instruments.verify.measure import GlowFit
 from hilstar.instruments.verify.summary import summarise
 from hilstar.instruments.verify.summary import verify as run_twin
 from hilstar.instruments.verify.verdict import Verdict as TwinVerdict
@@ -63,7 +65,7 @@ def verify(context: StepContext) -> StepOutcome:
     """
     stars_seen = _enough_frames(context)
     count = len(stars_seen.place_px)
-    figures = _place_figures(context, stars_seen)
+    figures = _place_figures(stars_seen, context.geometry().tracker.focal_length_px)
     rms_arcsec = float(figures["star_rms_arcsec"])
     rms = f"{figures['star_rms_px']:.3f} px ({rms_arcsec:.2f} arcsec) rms"
     picture = context.session / "verify.svg"
@@ -76,8 +78,8 @@ def verify(context: StepContext) -> StepOutcome:
     )
     line = (
         f"{count} stars on the screen are {rms} from where the sky has them,"
-        f" {noise_words(stars_seen)}; beyond it {figures['star_beyond_noise_p95_px']:.3f} px at"
-        " 95 %"
+        f" {noise_words(stars_seen.residual_px, stars_seen.place_noise_px)}; beyond it"
+        f" {figures['star_beyond_noise_p95_px']:.3f} px at 95 %"
     )
     reasons: list[str] = []
     pictures = [picture]
@@ -96,13 +98,14 @@ def verify(context: StepContext) -> StepOutcome:
     else:
         line += f"; the light of {sure_stars} can be read, too few to judge it"
     is_scattered = bool(reasons)
-    reasons += place_reasons(stars_seen, context.file.config.verify.centroid_px)
-    reasons += _star_reasons(context, figures, is_scattered=is_scattered)
+    limits = context.file.config.verify
+    reasons += place_reasons(stars_seen.beyond_px, stars_seen.frames, limits.centroid_px)
+    reasons += _star_reasons(figures, limits.flux_mag, is_scattered=is_scattered)
     twin_figures, twin_reasons = _twin_figures(context)
     figures |= twin_figures
     reasons += twin_reasons
     if context.truth is not None:
-        figures |= _against_truth(context)
+        figures |= _against_truth(context.file, context.truth)
         line += (
             f"; against the truth, places are {figures['truth_rms_arcsec']:.2f} arcsec rms off, and"
             f" stars of the twin {figures['twin_flux_p95_mag']:.3f} mag at 95 %"
@@ -121,13 +124,14 @@ def verify(context: StepContext) -> StepOutcome:
     return StepOutcome(verdict, line, figures, files, tuple(pictures), number=number)
 
 
-def _place_figures(context: StepContext, seen: StarsSeen) -> dict[str, Figure]:
-    """How far stars are from where the sky has them, and how much of that is beyond noise."""
+def _place_figures(seen: StarsSeen, focal_length_px: float) -> dict[str, Figure]:
+    """How far stars are from where the sky has them, and how much of that is beyond noise, before
+    a tracker of this focal length.
+    """
     off_px = np.hypot(*seen.residual_px.T)
     rms_px = float(np.sqrt((off_px**2).mean()))
     noise_px = float(np.sqrt((seen.place_noise_px**2).mean()))
     beyond = seen.beyond_px
-    focal_length_px = context.geometry().tracker.focal_length_px
     p95_px = float(np.percentile(off_px, 95))
     return {
         "stars": len(off_px),
@@ -160,12 +164,12 @@ def _twin_figures(context: StepContext) -> tuple[dict[str, Figure], list[str]]:
     return figures, [f"the twin: {reason}" for reason in twin["reasons"]]
 
 
-def noise_words(seen: StarsSeen) -> str:
-    """How much of the stars' distances is noise: all of it where they are no farther off than
-    their noise makes them.
+def noise_words(residual_px: FloatArray, place_noise_px: FloatArray) -> str:
+    """How much of the stars' distances (n, 2) is noise, of which each has (n,) along an axis: all
+    where they are no farther off than it makes them.
     """
-    rms_px = float(np.sqrt((np.hypot(*seen.residual_px.T) ** 2).mean()))
-    noise_px = math.sqrt(2) * float(np.sqrt((seen.place_noise_px**2).mean()))
+    rms_px = float(np.sqrt((np.hypot(*residual_px.T) ** 2).mean()))
+    noise_px = math.sqrt(2) * float(np.sqrt((place_noise_px**2).mean()))
     if noise_px >= rms_px:
         return f"no more than their noise makes ({noise_px:.3f} px)"
     return f"of which noise is {noise_px:.3f} px"
@@ -176,32 +180,31 @@ def _enough_frames(context: StepContext) -> StarsSeen:
     were asked for.
     """
     stars_seen = see_stars(context, context.frames or 1)
-    wanted = frames_for(stars_seen, context.file.config.verify.centroid_px)
+    limit_px = context.file.config.verify.centroid_px
+    wanted = frames_for(stars_seen.beyond_px, stars_seen.frames, limit_px)
     if context.frames or context.source.by_hand or not 1 < wanted <= MAX_FRAMES:
         return stars_seen
     return see_stars(context, wanted)
 
 
-def frames_for(seen: StarsSeen, limit_px: float) -> int:
-    """How many frames would tell whether the stars' places are within the limit at 95 %; those
-    seen where they tell it.
+def frames_for(beyond: Beyond, frames: int, limit_px: float) -> int:
+    """How many frames would tell whether the stars' places, by `frames` so far off beyond their
+    noise, are within the limit at 95 %; those where they tell it.
     """
-    beyond = seen.beyond_px
     limit = limit_px / P95_OF_TWO
     if beyond.high <= limit or beyond.low > limit:
-        return seen.frames
+        return frames
     room = limit**2 - beyond.sigma**2
     doubt = beyond.high**2 - beyond.sigma**2
     # the doubt shrinks with the frames; a scatter near the limit itself takes four times as many
-    frames = math.ceil(seen.frames * doubt / max(room, limit**2 / 4))
-    return max(frames, seen.frames + 1)
+    wanted = math.ceil(frames * doubt / max(room, limit**2 / 4))
+    return max(wanted, frames + 1)
 
 
-def place_reasons(seen: StarsSeen, limit_px: float) -> list[str]:
-    """What speaks against the stars' places: geometry where they are off beyond their noise, or
-    noise that hides it.
+def place_reasons(beyond: Beyond, frames: int, limit_px: float) -> list[str]:
+    """What speaks against the stars' places in so many frames: geometry where they are off beyond
+    their noise, or noise that hides it.
     """
-    beyond = seen.beyond_px
     at_least = P95_OF_TWO * beyond.low
     at_most = P95_OF_TWO * beyond.high
     if at_least > limit_px:
@@ -210,8 +213,8 @@ def place_reasons(seen: StarsSeen, limit_px: float) -> list[str]:
             f" {limit_px:g})"
         )
         return [f"{off}: run the geometry again (--again geometry)"]
-    wanted = frames_for(seen, limit_px)
-    if at_most <= limit_px or wanted == seen.frames:
+    wanted = frames_for(beyond, frames, limit_px)
+    if at_most <= limit_px or wanted == frames:
         return []
     cure = "write a longer [tracker] exposure_s"
     if wanted <= MAX_ASKED_FRAMES:
@@ -226,27 +229,29 @@ def place_reasons(seen: StarsSeen, limit_px: float) -> list[str]:
 
 
 def _twin(context: StepContext) -> TwinVerdict:
-    """The twin's verdict; its black level is judged no closer than the session knows it, and the
-    light of white, by which it glows.
+    """The twin's verdict, its glow by what the session knows of it."""
+    file = _twin_file(context.file, context.truth)
+    twin_run = run_twin(file, VERIFY_FIELDS, np.random.default_rng(VERIFY_SEED))
+    known_glow = _known_glow(twin_run.measured.glow, context.known)
+    return judge(dataclasses.replace(twin_run.measured, glow=known_glow))
+
+
+def _known_glow(glow: GlowFit, figures: Mapping[str, Figure]) -> GlowFit:
+    """A glow that is judged no closer than the session knows the black level, and the light of
+    white, by which it glows.
     """
-    twin_run = run_twin(_twin_file(context), VERIFY_FIELDS, np.random.default_rng(VERIFY_SEED))
-    glow = twin_run.measured.glow
-    figures = context.known
     known = float(figures.get("scale.error_mag", 0.0)) / MAG_PER_RELATIVE
     black = float(figures.get(BLACK_LEVEL, 0.0))
     if black > 0:
         known = math.hypot(known, float(figures.get(BLACK_ERROR, 0.0)) / black)
     limit = max(glow.limit_e_per_s_px, AGREE_SIGMAS * known * glow.assumed_e_per_s_px)
-    known_glow = dataclasses.replace(glow, limit_e_per_s_px=limit)
-    return judge(dataclasses.replace(twin_run.measured, glow=known_glow))
+    return dataclasses.replace(glow, limit_e_per_s_px=limit)
 
 
-def _twin_file(context: StepContext) -> BenchFile:
+def _twin_file(file: BenchFile, truth: BenchFile | None) -> BenchFile:
     """The bench file for the twin; in a virtual session with the truth's calibration and
     geometry as true.
     """
-    truth = context.truth
-    file = context.file
     if truth is None:
         return file
     monitor = truth.config.monitor
@@ -307,13 +312,10 @@ def _light_figures(
     return figures, scatter.finding
 
 
-def _star_reasons(
-    context: StepContext, figures: dict[str, Figure], *, is_scattered: bool
-) -> list[str]:
-    """The limits of [verify] that the stars miss, with advice; not their light again where its
-    scatter has been told.
+def _star_reasons(figures: dict[str, Figure], limit_mag: float, *, is_scattered: bool) -> list[str]:
+    """The limits that the stars miss, of their light in magnitudes, with advice; not their light
+    again where its scatter has been told.
     """
-    limit_mag = context.file.config.verify.flux_mag
     lost = float(figures["lost"])
     reasons = []
     if lost > LOST_SHARE * (lost + float(figures["stars"])):
@@ -333,20 +335,18 @@ def _star_reasons(
     return reasons
 
 
-def _against_truth(context: StepContext) -> dict[str, Figure]:
+def _against_truth(file: BenchFile, truth: BenchFile) -> dict[str, Figure]:
     """The error of the directions of places on the screen against the truth.
 
     Only places that the tracker sees were calibrated; the others have no direction.
     """
-    truth = context.truth
-    assert truth is not None
-    width, height = context.resolution_px
+    width, height = file.config.monitor.resolution_px
     columns = np.linspace(0, width - 1, GRID)
     rows = np.linspace(0, height - 1, GRID)
     grid_x, grid_y = np.meshgrid(columns, rows)
     x = grid_x.ravel()
     y = grid_y.ravel()
-    fitted = _directions(context.file, x, y)
+    fitted = _directions(file, x, y)
     true = _directions(truth, x, y)
     off = np.linalg.norm(np.cross(fitted, true), axis=1) * ARCSEC_PER_RAD
     known = np.isfinite(off)
@@ -393,8 +393,9 @@ def scale(context: StepContext) -> StepOutcome:
     found_white = star_scale.flux_at_white_e_per_s
     scatter = stars_seen.scatter(ratios_mag, used)
     off_mag = float(magnitude(found_white / white))
-    error_mag = _scale_error_mag(star_scale, stars_seen.rounding_mag[used])
-    trend_mag, trend_error_mag = _scale_trend(stars_seen, used, ratios_mag, star_scale.weights)
+    rounding_mag = stars_seen.rounding_mag[used]
+    error_mag = _scale_error_mag(star_scale, rounding_mag)
+    trend_mag, trend_error_mag = _scale_trend(asked, ratios_mag, star_scale.weights, rounding_mag)
     figures: dict[str, Figure] = {
         "flux_at_white_e_per_s": found_white,
         "in_bench_file_e_per_s": white,
@@ -464,19 +465,16 @@ def _scale_error_mag(star_scale: MeasuredScale, rounding_mag: FloatArray) -> flo
 
 
 def _scale_trend(
-    seen: StarsSeen, used: BoolArray, ratios_mag: FloatArray, weights: FloatArray
+    e_per_s: FloatArray, ratios_mag: FloatArray, weights: FloatArray, rounding_mag: FloatArray
 ) -> tuple[float, float]:
-    """The change of full scale from the faintest to the brightest star, mag, and its error, that by
-    the ADC's rounding in it.
+    """The change of full scale (n,) from the faintest to the brightest star, mag, and its error,
+    that by the ADC's rounding of stars (n, phases) in it.
     """
-    asked = seen.e_per_s[used]
     root = np.sqrt(weights)
-    trend_mag, error_mag = trend(asked, ratios_mag, root)
-    by_phase_mag = [
-        trend(asked, rounding_mag, root)[0] for rounding_mag in seen.rounding_mag[used].T
-    ]
-    rounding_mag = float(np.sqrt(np.mean(np.square(by_phase_mag))))
-    return trend_mag, math.hypot(error_mag, rounding_mag)
+    trend_mag, error_mag = trend(e_per_s, ratios_mag, root)
+    by_phase_mag = [trend(e_per_s, phase_mag, root)[0] for phase_mag in rounding_mag.T]
+    by_rounding_mag = float(np.sqrt(np.mean(np.square(by_phase_mag))))
+    return trend_mag, math.hypot(error_mag, by_rounding_mag)
 
 
 def _contradictions(

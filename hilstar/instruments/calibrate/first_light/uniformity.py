@@ -41,9 +41,10 @@ from hilstar.instruments.calibrate.warm_up import (
     watch_white,
 )
 from hilstar.instruments.simulate.bench_geometry import PIXELS_AT_ONCE, BenchGeometry
-from hilstar.server.bench.bench_file import BenchFile
+from hilstar.server.bench.config.certify import VirtualSettings
 from hilstar.server.bench.monitor import bench_calibration, calibration_source
 from hilstar.tracker.centroids import noisiest_background
+from hilstar.tracker.settings import DetectorSettings
 
 APART_TRACKER_PX, APART_SIGMAS = 10.0, 16.0  # from dot to dot
 # Radius of the circle about a dot whose light is summed. At most a quarter of a period, so that no
@@ -143,14 +144,9 @@ def uniformity(context: StepContext) -> StepOutcome:
     if known is not None:
         known_light = known[dots.y, dots.x].astype(np.float64)
         against = map_of(dots, dots.light / known_light, size_px)
+    error_mag = known_error_mag(light_map, against, dots.noise_mag)
     figures = _figures(context, dots, light_map, against)
-    if against.is_even:
-        # The bench file keeps its map, and the error is that map's.
-        figures["map_error_mag"] = math.hypot(against.error_mag(dots.noise_mag), against.rms_mag)
-    elif light_map.is_even:
-        own_error_mag = light_map.error_mag(dots.noise_mag)
-        figures["map_error_mag"] = math.hypot(own_error_mag, light_map.rms_mag)
-    error_mag = float(figures["map_error_mag"])
+    figures["map_error_mag"] = error_mag
     line = (
         f"{_in_words(light_map, known is not None)}; {len(dots.light)} dots differ from that by"
         f" {light_map.left_mag:.4f} mag (noise {dots.noise_mag:.4f})"
@@ -189,6 +185,21 @@ def uniformity(context: StepContext) -> StepOutcome:
         # noise, it may be needed.
         fitted = (FittedFigure("the map's rows", light_map.grid.shape[0], 0.0, ROWS[-1]),)
     return StepOutcome(verdict, line, figures, tuple(files), (picture,), changes, number, fitted)
+
+
+def known_error_mag(light_map: UniformityMap, against: UniformityMap, noise_mag: float) -> float:
+    """The error of the light at a dot that the bench file then has, by dots with this noise:
+    where light is called even, what its map has adds to that map's own.
+
+    `against` is the map of what the bench file's own leaves.
+    """
+    if against.is_even:
+        # the bench file keeps its map
+        return math.hypot(against.error_mag(noise_mag), against.rms_mag)
+    own_error_mag = light_map.error_mag(noise_mag)
+    if light_map.is_even:
+        return math.hypot(own_error_mag, light_map.rms_mag)
+    return own_error_mag
 
 
 def _write_map(
@@ -238,7 +249,8 @@ def warm_up(context: StepContext) -> StepOutcome:
     figures["readings"] = len(light)
     figures["stable"] = "yes" if judged.is_stable else "no"
     if context.truth is not None:
-        figures |= _warm_up_truth(context.truth, judged, ended_s, float(t_s[-1]))
+        virtual = context.truth.config.certify.virtual
+        figures |= _warm_up_truth(virtual, judged.limit, ended_s, float(t_s[-1]))
     number = None
     if judged.law != "none":
         number = StepNumber(
@@ -293,9 +305,7 @@ class _White:
             self._lit = self._lit_pixels(looked)
             near = binary_dilation(self._lit, iterations=RING_PX)
             self._beside = near & self._cold & ~self._lit
-        # What black pixels glow more than in the dark frame is no light of the dots.
-        glow = looked.image[self._beside].mean() * self._lit.sum()
-        return float(looked.image[self._lit].sum() - glow)
+        return light_of_dots(looked.image, self._lit, self._beside)
 
     def _lit_pixels(self, looked: DarkSubtracted) -> BoolArray:
         """The pixels that the dots light. Raises InputError where there are none."""
@@ -307,6 +317,15 @@ class _White:
                 " is on"
             )
         return np.asarray(lit)
+
+
+def light_of_dots(image: FloatArray, lit: BoolArray, beside: BoolArray) -> float:
+    """The light of dots, DN, in lit pixels of an image (h, w), of which those beside them tell the
+    glow.
+    """
+    # what black pixels glow more than in the dark frame is no light of the dots
+    glow = image[beside].mean() * lit.sum()
+    return float(image[lit].sum() - glow)
 
 
 def _draw_warm_up(picture: Path, judged: WarmUp, t_s: FloatArray, light: FloatArray) -> None:
@@ -321,19 +340,18 @@ def _draw_warm_up(picture: Path, judged: WarmUp, t_s: FloatArray, light: FloatAr
 
 
 def _warm_up_truth(
-    truth: BenchFile, judged: WarmUp, ended_s: float, last_s: float
+    virtual: VirtualSettings, limit: float, ended_s: float, last_s: float
 ) -> dict[str, Figure]:
     """The drift that was planted, and when it is within the limit; the watch ended at `ended_s` of
     the monitor's own time, at `last_s` of the watch's.
     """
-    virtual = truth.config.certify.virtual
     tau_s = 60 * virtual.warm_up_min
     change = virtual.cold_percent / 100
     exponential_slope = change / tau_s * math.exp(-ended_s / tau_s)
     slope = exponential_slope + virtual.drift_percent_per_h / 100 / S_PER_H
     # by its exponential alone
     change_ahead = abs(change) * -math.expm1(-AHEAD_S / tau_s)
-    stable_s = tau_s * math.log(max(change_ahead, 1e-300) / judged.limit)
+    stable_s = tau_s * math.log(max(change_ahead, 1e-300) / limit)
     return {
         "truth_drift_percent_per_h": 100 * S_PER_H * slope,
         "truth_stable_after_s": max(stable_s - (ended_s - last_s), 0.0),
@@ -351,12 +369,16 @@ class DotSpacing(NamedTuple):
 
 
 def _spacing(context: StepContext) -> DotSpacing:
+    """The lattice of a bench's dots."""
+    return spacing_for(context.real_geometry(), context.psf_sigma_px)
+
+
+def spacing_for(geometry: BenchGeometry, psf_sigma_px: float) -> DotSpacing:
     """A lattice whose dots are apart in the tracker's image, and not too many."""
-    geometry = context.real_geometry()
     ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
-    sigma_px = math.hypot(context.psf_sigma_px, DOT_PX * ratio / math.sqrt(12))
+    sigma_px = math.hypot(psf_sigma_px, DOT_PX * ratio / math.sqrt(12))
     apart_px = max(APART_TRACKER_PX, APART_SIGMAS * sigma_px) / ratio
-    fewest_px = max(context.resolution_px) / MAX_DOTS
+    fewest_px = max(geometry.monitor.resolution_px) / MAX_DOTS
     # even: a shift by half of it is whole
     period = 2 * math.ceil(max(apart_px, fewest_px) / 2)
     reach = min(REACH * period, REACH_SIGMAS * sigma_px / ratio)
@@ -400,7 +422,6 @@ def _figures(
         "off_bench_file_rms_mag": against.rms_mag,
         "left_rms_mag": found.left_mag,
         "dot_noise_mag": dots.noise_mag,
-        "map_error_mag": found.error_mag(dots.noise_mag),
     }
     if context.truth is not None:
         monitor = context.truth.config.monitor
@@ -450,7 +471,8 @@ def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
     """
     geometry = context.real_geometry()
     ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
-    sigma_px, period, reach = _spacing(context)
+    spacing = _spacing(context)
+    _, period, reach = spacing
     dark_path = context.dark()
     dark = context.read(dark_path)
     bad = unusable_pixels(dark, context.full_dn)
@@ -473,16 +495,25 @@ def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
     if lit.sum() < MIN_DOTS:
         few = f"{int(lit.sum())} dots are seen whole and {MIN_DOTS} are needed"
         raise InputError(f"{few}; look at the geometry and the focus")
-    detector = context.detector
     dn = float(np.median(light[lit]))
-    pixels = math.pi * (reach * ratio) ** 2
+    reach_px = reach * ratio
+    noise_mag = dot_noise_mag(dn, noise_dn, reach_px, spacing.sigma_px, context.detector)
+    seen_dots = DotLight(column[lit], row[lit], light[lit], noise_mag)
+    return seen_dots, (dark_path, *(looked.path for looked in looks))
+
+
+def dot_noise_mag(
+    dn: float, noise_dn: float, reach_px: float, sigma_px: float, detector: DetectorSettings
+) -> float:
+    """The noise of a dot's light, which is summed within its reach over a background of `noise_dn`
+    in a pixel, tracker px.
+    """
+    pixels = math.pi * reach_px**2
     # The noise of the dark frame is in that of the image above it; PRNU averages over a dot's
     # pixels.
     sum_dn2 = dn / detector.gain_e_per_dn + pixels * noise_dn**2
     response2 = detector.prnu**2 / (4 * math.pi * sigma_px**2)
-    noise = math.sqrt(sum_dn2 / dn**2 + response2)
-    seen_dots = DotLight(column[lit], row[lit], light[lit], MAG_PER_RELATIVE * noise)
-    return seen_dots, (dark_path, *(looked.path for looked in looks))
+    return MAG_PER_RELATIVE * math.sqrt(sum_dn2 / dn**2 + response2)
 
 
 def unusable_pixels(dark: FloatArray, full_dn: float) -> BoolArray:

@@ -308,11 +308,18 @@ class _Loss:
         return weight**2
 
     def value(self, off: FloatArray, numbers: FloatArray) -> float:
-        """The loss: Huber's of the residuals, and the prior of the numbers."""
-        size = np.abs(off)
-        losses = np.where(size <= HUBER, 0.5 * size**2, HUBER * (size - HUBER / 2))
-        prior_loss = 0.5 * self.prior(len(numbers)) @ numbers**2
-        return float(losses.sum() + prior_loss)
+        """The loss of residuals and numbers."""
+        return loss_of(off, numbers, self.prior(len(numbers)))
+
+
+def loss_of(off: FloatArray, numbers: FloatArray, prior: FloatArray) -> float:
+    """Huber's loss of the residuals (n,), in sigmas, and that of numbers by their prior's weights
+    (m,).
+    """
+    size = np.abs(off)
+    losses = np.where(size <= HUBER, 0.5 * size**2, HUBER * (size - HUBER / 2))
+    prior_loss = 0.5 * prior @ numbers**2
+    return float(losses.sum() + prior_loss)
 
 
 def fit(

@@ -116,7 +116,8 @@ class Calibrated:
     @property
     def measurable(self) -> list[BoolArray]:
         """For each pose, a mask of the dots (dots,) whose windows are in the tracker's image."""
-        return _in_view(self.fit, self.plan.x_px, self.plan.y_px, self.data.centroids.edge_px)
+        edge_px = self.data.centroids.edge_px
+        return in_view(self.fit.geometry, self.plan.x_px, self.plan.y_px, edge_px)
 
     @property
     def false(self) -> int:
@@ -180,25 +181,32 @@ def calibrate_seen(
     """Fit the geometry of a bench file to centroids of planned dots, seen through a PSF of this
     sigma (default: the bench file's). Raises InputError.
     """
-    known = tracker_is_ideal or file.config.tracker.distortion is not None
     nominal = nominal_of(file)
     if psf_sigma_px is None:
         psf_sigma_px = psf_sigma_of(file)
-    if psf_sigma_px <= SMOOTH_PSF_PX:
-        seen = without_s_curves(plan, nominal, seen, psf_sigma_px)
+    seen = without_s_curves(plan, nominal, seen, psf_sigma_px)
+    known = is_tracker_known(file, is_ideal=tracker_is_ideal)
+    rng = np.random.default_rng(SEED)
     try:
-        return calibrate_geometry(
-            plan, nominal, seen, np.random.default_rng(SEED), tracker_known=known
-        )
+        return calibrate_geometry(plan, nominal, seen, rng, tracker_known=known)
     except MisfitError as error:
-        sigma_px = dot_sigma_px(file)
-        if sigma_px > NARROW_DOT_PX:
-            raise
-        raise MisfitError(
-            f"{error}, or dots of sigma {sigma_px:.2f} px lie within a tracker pixel, whose"
-            " centroids depend on where: write [tracker] psf_sigma_px as `hilstar calibrate focus`"
-            " measures it, or defocus the tracker a little"
-        ) from error
+        raise MisfitError(misfit_words(str(error), dot_sigma_px(file))) from error
+
+
+def misfit_words(misfit: str, sigma_px: float) -> str:
+    """What is said of a misfit where dots have this sigma, tracker px."""
+    if sigma_px > NARROW_DOT_PX:
+        return misfit
+    return (
+        f"{misfit}, or dots of sigma {sigma_px:.2f} px lie within a tracker pixel, whose centroids"
+        " depend on where: write [tracker] psf_sigma_px as `hilstar calibrate focus` measures it,"
+        " or defocus the tracker a little"
+    )
+
+
+def is_tracker_known(file: BenchFile, *, is_ideal: bool) -> bool:
+    """Whether the tracker's own lens is held: it is ideal, or the bench file states it."""
+    return is_ideal or file.config.tracker.distortion is not None
 
 
 def nominal_of(file: BenchFile) -> fits.Nominal:
@@ -253,8 +261,10 @@ def without_s_curves(
     plan: DotPlan, nominal: fits.Nominal, seen: Observed, psf_sigma_px: float
 ) -> Observed:
     """Centroids without the bias by a dot's place within a pixel, its side and turn by a first
-    fit. Raises InputError.
+    fit; as they are where the PSF is smooth. Raises InputError.
     """
+    if psf_sigma_px > SMOOTH_PSF_PX:
+        return seen
     look = first_look(plan, nominal, seen, np.random.default_rng(SEED))
     problem, data = matched(plan, nominal, seen, look)
     refuse_few(data)
@@ -328,7 +338,10 @@ def calibrate_geometry(
         centroids=len(seen),
         tracker_known=tracker_known,
     )
-    _refuse_gaps(calibrated)
+    is_expected = np.any(calibrated.measurable, axis=0)
+    is_seen = np.zeros(len(plan), dtype=bool)
+    is_seen[np.unique(calibrated.data.dot)] = True
+    refuse_gaps(plan, nominal.monitor.resolution_px, is_expected, is_seen)
     refuse_misfit(chosen.rms_arcsec, calibrated.held_out_noise_arcsec)
     return calibrated
 
@@ -356,7 +369,7 @@ def bounded_to_field(problem: fits.Problem, fit: fits.Fit) -> fits.Fit:
     columns = np.linspace(-0.5, screen_width - 0.5, SCREEN_PLACES)
     rows = np.linspace(-0.5, screen_height - 0.5, SCREEN_PLACES)
     x_px, y_px = np.meshgrid(columns, rows)
-    if all(inside.all() for inside in _in_view(fit, x_px.ravel(), y_px.ravel())):
+    if all(inside.all() for inside in in_view(fit.geometry, x_px.ravel(), y_px.ravel())):
         return fit
     width, height = geometry.tracker.resolution_px
     corner_x = np.array([-0.5, width - 0.5, -0.5, width - 0.5])
@@ -415,32 +428,30 @@ def _problem(
     return fits.Problem(plan, nominal, look.q_poses, noise_px)
 
 
-def _in_view(
-    fit: fits.Fit, x_px: FloatArray, y_px: FloatArray, edge_px: float = 0.0
+def in_view(
+    geometry: fits.Geometry, x_px: FloatArray, y_px: FloatArray, edge_px: float = 0.0
 ) -> list[BoolArray]:
     """For each pose, a mask of the monitor's pixels (n,) in the tracker's field, farther than
     `edge_px` from its edge.
     """
-    geometry = fit.geometry
     directions = geometry.monitor.rays(x_px, y_px)
     width, height = geometry.tracker.resolution_px
-    in_view = []
+    seen_by_pose = []
     for q in geometry.q_poses:
         x, y = geometry.tracker.project(directions @ to_matrix(q).T)
         across = (x > edge_px) & (x < width - 1 - edge_px)
         down = (y > edge_px) & (y < height - 1 - edge_px)
-        in_view.append(across & down)
-    return in_view
+        seen_by_pose.append(across & down)
+    return seen_by_pose
 
 
-def _refuse_gaps(calibrated: Calibrated) -> None:
-    """Refuse (InputError) a part of the screen in the tracker's field whose dots were not seen."""
-    plan = calibrated.plan
-    problem = calibrated.problem
-    is_expected = np.any(calibrated.measurable, axis=0)
-    is_seen = np.zeros(len(plan), dtype=bool)
-    is_seen[np.unique(calibrated.data.dot)] = True
-    width, height = problem.nominal.monitor.resolution_px
+def refuse_gaps(
+    plan: DotPlan, resolution_px: tuple[int, int], is_expected: BoolArray, is_seen: BoolArray
+) -> None:
+    """Refuse (InputError) a part of a screen of this size of which the tracker has a plan's dots
+    (n,) in its field and has not seen them.
+    """
+    width, height = resolution_px
     column = np.clip((plan.x_px * 3 / width).astype(int), 0, 2)
     row = np.clip((plan.y_px * 3 / height).astype(int), 0, 2)
     for r, vertical in enumerate(CELLS[1]):

@@ -264,13 +264,23 @@ def _map_of(
 ) -> FloatArray | None:
     """The projective map (3, 3) from tracker tangents to monitor px that most decoded dots fit;
     None where few fit any.
+    """
+    decoded = decode(plan, seen)
+    tangents = np.stack(nominal.tracker.tangents(decoded.x_px, decoded.y_px))
+    places_px = np.stack([plan.x_px[decoded.dot], plan.y_px[decoded.dot]])
+    return fitting_map(tangents, places_px, INLIER_SHARE * plan.extent_px, rng)
+
+
+def fitting_map(
+    tangents: FloatArray, places_px: FloatArray, near_px: float, rng: np.random.Generator
+) -> FloatArray | None:
+    """The projective map (3, 3) that takes most tangents (2, n) near their places (2, n); None
+    where few fit any.
 
     RANSAC with samples of four (Fischler and Bolles 1981).
     """
-    decoded = decode(plan, seen)
-    u, v = nominal.tracker.tangents(decoded.x_px, decoded.y_px)
-    x = plan.x_px[decoded.dot]
-    y = plan.y_px[decoded.dot]
+    u, v = tangents
+    x, y = places_px
     best = np.zeros(len(u), dtype=bool)
     fours = np.empty((0, 4), dtype=int)
     if len(u) >= MIN_DECODED:
@@ -282,7 +292,7 @@ def _map_of(
         mapped_x, mapped_y = mapped(trial, u, v)
         with np.errstate(invalid="ignore"):
             distance_px = np.hypot(mapped_x - x, mapped_y - y)
-            inlier = distance_px < INLIER_SHARE * plan.extent_px
+            inlier = distance_px < near_px
         if inlier.sum() > best.sum():
             best = inlier
     if best.sum() < max(MIN_DECODED, len(u) / 3):
@@ -402,15 +412,19 @@ def refuse_motion(data: MatchedDots) -> None:
         for axis, places in (("x", here.centroids.x_px), ("y", here.centroids.y_px)):
             frames, shift, noise = frame_shifts(here, places)
             motion_px = np.ptp(shift)
-            # the median of few dots scatters by itself
-            dots_a_frame = len(here) / len(frames)
-            by_chance = MAX_CHANCE * noise / np.sqrt(dots_a_frame)
-            if motion_px > max(MIN_MOTION_PX, MOTION_NOISE * noise, by_chance):
+            if motion_px > motion_limit_px(noise, len(here) / len(frames)):
                 first, last = sorted((frames[shift.argmin()], frames[shift.argmax()]))
                 raise InputError(
                     f"the image moved by {motion_px:.2f} px in {axis} between frames {first}"
                     f" and {last}: fix the tracker and the screen, and take new frames"
                 )
+
+
+def motion_limit_px(noise: float, dots_a_frame: float) -> float:
+    """The motion between frames that dots with a noise, px, may show at rest."""
+    # the median of few dots scatters by itself
+    by_chance = MAX_CHANCE * noise / np.sqrt(dots_a_frame)
+    return float(max(MIN_MOTION_PX, MOTION_NOISE * noise, by_chance))
 
 
 class FrameShifts(NamedTuple):

@@ -53,6 +53,9 @@ GLASS_LOOK = FrontLook(
     line=None, bar={"lw": 1.0, "alpha": 0.4}, beaten={"ms": 4}, ring_pt={}, ring_width=0
 )
 
+# Places (x, y) of stars (n,), px from the middles of their stamps (n, side, side).
+Finder = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+
 
 @dataclass(frozen=True, slots=True)
 class GlassRow:
@@ -116,7 +119,7 @@ def glass_rows(file: BenchFile, scene: ChainScene, quick: bool) -> list[GlassRow
         simulators = []
         for psf in drawable.values():
             simulators.append(stack.enter_context(Simulator(file, psf=psf)))
-        errors = _errors(simulators[0], whole, drawable, scene)
+        errors = errors_in(simulators[0], whole, drawable, scene)
         if not errors:
             return []
         view = simulators[0].view(scene.q_icrs_to_cam, np.zeros(3))
@@ -161,7 +164,7 @@ def _drawable(whole: GlassPsf) -> Iterator[tuple[str, Psf]]:
             continue
 
 
-def _errors(
+def errors_in(
     tracker: Simulator, whole: GlassPsf, psfs: Mapping[str, Psf], scene: ChainScene
 ) -> dict[str, GlassErrors]:
     """The errors of each PSF in a scene; empty where too few stars are lit."""
@@ -171,22 +174,35 @@ def _errors(
     column = np.floor(stars["x_px"] + 0.5).astype(np.intp)
     shares = StarGlass(tracker.file, whole).shares_of(tracker.stars, stars["hip"])
     light = whole.unreduced(stars["x_px"], stars["y_px"], shares)
+    stamps = {}
+    for name, psf in psfs.items():
+        psf_stamp = told_psf(psf, (row, column), 2 * reach + 1, shares)
+        stamps[name] = psf_stamp(stars["x_px"] - column, stars["y_px"] - row)
+    find = partial(
+        star_places, kind=tracker.config.verify.judge or "window", sigma_px=whole.width_px
+    )
+    return stamp_errors(light, stamps, find, ARCSEC_PER_RAD / tracker.camera.scales_px_rad()[1])
+
+
+def stamp_errors(
+    light: FloatArray, stamps: Mapping[str, FloatArray], find: Finder, arcsec_per_px: float
+) -> dict[str, GlassErrors]:
+    """The errors of stars' stamps (n, side, side) against their true `light`, by the name of each;
+    empty where fewer than MIN_STARS are lit.
+    """
     lit = light.sum(axis=(1, 2)) > 0  # a corner may be dark
     if lit.sum() < MIN_STARS:
         return {}
-    kind = tracker.config.verify.judge or "window"
-    arcsec_per_px = ARCSEC_PER_RAD / tracker.camera.scales_px_rad()[1]
 
     def measured(stamps: FloatArray) -> FloatArray:
         """Places and light of the lit stars, (3, n)."""
-        x_px, y_px = star_places(stamps[lit], kind, whole.width_px)
+        x_px, y_px = find(stamps[lit])
         return np.stack([x_px, y_px, stamps[lit].sum(axis=(1, 2))])
 
     true_x, true_y, true_light = measured(light)
     errors = {}
-    for name, psf in psfs.items():
-        psf_stamp = told_psf(psf, (row, column), 2 * reach + 1, shares)
-        x, y, flux = measured(psf_stamp(stars["x_px"] - column, stars["y_px"] - row))
+    for name, of_psf in stamps.items():
+        x, y, flux = measured(of_psf)
         place = np.hypot(x - true_x, y - true_y) * arcsec_per_px
         percent = 100 * (flux / true_light - 1)
         largest = rounded(float(np.abs(percent).max()))

@@ -12,6 +12,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from hilstar.attitude.clock.timeline import Attitude, Timeline
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.rotation import propagate
 from hilstar.basics.units import ERROR_OF_MEDIAN, NS_PER_S
+from hilstar.display.response import Levels
 from hilstar.instruments.study.chain import choices
 from hilstar.instruments.study.chain.tracker import (
     Off,
@@ -32,6 +34,8 @@ from hilstar.instruments.study.chain.tracker import (
 from hilstar.instruments.study.predictors import Movement, attitude_at
 from hilstar.instruments.study.sweep import Spent, spent
 from hilstar.optics.frame_motion import CameraTurn, swept_sprites
+from hilstar.optics.sprites import FrameLight
+from hilstar.server.bench.drawn import Drawn
 from hilstar.server.bench.frame import Bench
 from hilstar.sky.stars import Stars
 
@@ -97,21 +101,17 @@ class DrawingChain:
         """The mean light (H, W) over an exposure; at rest one frame stands for all, except with
         `temporal`.
         """
-        alike = not self.movement.turns and self.combination.quantisation != "temporal"
+        alike = is_alike(self.movement, self.combination)
         return (seen.at_rest if alike else seen.mean)(self.lit, self.bench.camera.resolution_px)
 
     def sprite_px(self) -> str:
         """The sides of its sprites, px."""
-        sides = [side.side_px for side in self.bench.renderer.target.sides] or [
-            self.bench.psf.footprint_px
-        ]
-        low = min(sides)
-        high = max(sides)
-        return f"{low}" if low == high else f"{low} to {high}"
+        sides_px = [side.side_px for side in self.bench.renderer.target.sides]
+        return range_words(sides_px or [self.bench.psf.footprint_px])
 
     def frame_ms(self) -> Spent:
         """Wall and processor time of the next frame, ms."""
-        timeline, light_ns = self._next()
+        timeline, light_ns = self.next_frame()
 
         def draw() -> object:
             attitude = attitude_at(timeline, light_ns)
@@ -123,27 +123,58 @@ class DrawingChain:
 
     def stages_ms(self) -> tuple[float, ...]:
         """The next frame's time by STAGES, with a wait for the GPU before its codes are read."""
-        (timeline, light_ns), bench = self._next(), self.bench
-        marks = [time.perf_counter()]
-        attitude = attitude_at(timeline, light_ns)
-        marks.append(time.perf_counter())
-        sprites = bench.light(bench.view(attitude.q_icrs_to_cam, self.rate(attitude)))
-        marks.append(time.perf_counter())
-        drawn = bench.draw_sprites(sprites, self.timed_frames)
-        bench.renderer.finish()
-        marks.append(time.perf_counter())
-        _ = drawn.levels
-        marks.append(time.perf_counter())
-        return tuple((np.diff(marks) * 1e3).tolist())
+        (timeline, light_ns), bench = self.next_frame(), self.bench
 
-    def _next(self) -> tuple[Timeline, int]:
-        """The timeline of the next frame and its moment of light."""
+        def predicted(_: object) -> Attitude:
+            return attitude_at(timeline, light_ns)
+
+        def light(attitude: Attitude) -> FrameLight:
+            return bench.light(bench.view(attitude.q_icrs_to_cam, self.rate(attitude)))
+
+        def drawn(sprites: FrameLight) -> Drawn:
+            drawn = bench.draw_sprites(sprites, self.timed_frames)
+            bench.renderer.finish()
+            return drawn
+
+        def read(drawn: Drawn) -> Levels:
+            return drawn.levels
+
+        return laps_ms((predicted, light, drawn, read))
+
+    def next_frame(self) -> tuple[Timeline, int]:
+        """The timeline of the next frame that is timed, and its moment of light."""
         self.timed_frames += 1
         light_ns = NS_PER_S + self.timed_frames * round(
             NS_PER_S / self.bench.config.monitor.refresh_hz
         )
-        attitudes = propagate(self.movement.q_icrs_to_cam, NUDGE_RAD, self.timed_frames)
-        return self.timeline(replace(self.movement, q_icrs_to_cam=attitudes), light_ns), light_ns
+        return self.timeline(nudged(self.movement, self.timed_frames), light_ns), light_ns
+
+
+def is_alike(movement: Movement, combination: choices.ChainCombination) -> bool:
+    """Whether all frames of a scene are alike: at rest, except with `temporal`."""
+    return not movement.turns and combination.quantisation != "temporal"
+
+
+def range_words(sizes: Sequence[int]) -> str:
+    """The smallest and the largest of sizes, in words."""
+    low, high = min(sizes), max(sizes)
+    return f"{low}" if low == high else f"{low} to {high}"
+
+
+def nudged(movement: Movement, frame: int) -> Movement:
+    """The movement of a frame that is timed, with an attitude of its own."""
+    q_icrs_to_cam = propagate(movement.q_icrs_to_cam, NUDGE_RAD, frame)
+    return replace(movement, q_icrs_to_cam=q_icrs_to_cam)
+
+
+def laps_ms(works: Sequence[Callable[[Any], Any]]) -> tuple[float, ...]:
+    """The time of each of several works, ms, each of which is given what the one before gave."""
+    given = None
+    marks = [time.perf_counter()]
+    for work in works:
+        given = work(given)
+        marks.append(time.perf_counter())
+    return tuple((np.diff(marks) * 1e3).tolist())
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,16 +302,9 @@ class SceneMeasurement:
         )
         marked = (self.marks.default, self.marks.auto, self.marks.as_filed)
         self.combinations = list(dict.fromkeys([*possible, *marked]))
-        # At rest each exposure has its stars at other sub-pixel phases.
-        if self.movement.turns:
-            step_rad = np.zeros(3)
-        else:
-            step_rad = np.array([*PHASE_STEP_PX, 0.0]) / tracker.camera.focal_length_px
         self.judges = []
         for k, number in enumerate(FIRST_FRAMES[: plan.exposures]):
-            moved = replace(
-                self.movement, q_icrs_to_cam=propagate(scene.q_icrs_to_cam, step_rad, k)
-            )
+            moved = moved_on(self.movement, k, tracker.camera.focal_length_px)
             self.judges.append(StarJudge(tracker, moved, choices.exposure(parts.own, number)))
 
     @property
@@ -321,15 +345,13 @@ class SceneMeasurement:
     def row(self, chain: DrawingChain, taken: Times) -> CombinationRow:
         """A combination's row of the table."""
         own_combination = chain.combination
-        chosen = {DEFAULT: self.marks.default, AUTO: self.marks.auto}
-        marked = [name for name, combination in chosen.items() if combination == own_combination]
         return CombinationRow(
             scene=self.scene.name,
             rate_deg_s=self.scene.rate_deg_s,
             exposure_s=rounded(self.judges[0].seen.length_s),
             bits=self.parts.own.config.monitor.bits,
             sprite_px=chain.sprite_px(),
-            chosen=" ".join(marked),
+            chosen=chosen_words(own_combination, self.marks),
             as_filed=said(own_combination == self.marks.as_filed),
             **(asdict(own_combination) | {"bit_stealing": said(own_combination.bit_stealing)}),
             **asdict(self.error(own_combination)),
@@ -345,10 +367,31 @@ class SceneMeasurement:
             shown = judge.measure(self.tracker.image_e(light, judge.seen))
             star_errors.append(off(shown, judge.sky, judge.lost_arcsec))
             turns.append(attitude_off_arcsec(shown, judge.sky))
-        arcsec, mag = pooled(star_errors)
-        cross, roll = (rms_of_known(column) for column in zip(*turns, strict=True))
-        lost = sum(int(field_errors.lost.sum()) for field_errors in star_errors)
-        return Error(self.star_count, lost, *map(rounded, (arcsec, mag, cross, roll)))
+        return error_of(star_errors, turns)
+
+
+def moved_on(movement: Movement, exposure_number: int, focal_length_px: float) -> Movement:
+    """The movement of a scene's exposure: at rest each has its stars at other sub-pixel phases."""
+    if movement.turns:
+        return movement
+    step_rad = np.array([*PHASE_STEP_PX, 0.0]) / focal_length_px
+    q_icrs_to_cam = propagate(movement.q_icrs_to_cam, step_rad, exposure_number)
+    return replace(movement, q_icrs_to_cam=q_icrs_to_cam)
+
+
+def chosen_words(combination: choices.ChainCombination, marks: choices.Marks) -> str:
+    """What the table calls a combination: DEFAULT, AUTO, both or nothing."""
+    chosen = {DEFAULT: marks.default, AUTO: marks.auto}
+    return " ".join(name for name, marked in chosen.items() if marked == combination)
+
+
+def error_of(star_errors: Sequence[Off], turns: Sequence[tuple[float, float]]) -> Error:
+    """The error over several exposures, by the stars of each and their attitude's, arcsec."""
+    arcsec, mag = pooled(star_errors)
+    cross, roll = (rms_of_known(column) for column in zip(*turns, strict=True))
+    stars = sum(len(field_errors.lost) for field_errors in star_errors)
+    lost = sum(int(field_errors.lost.sum()) for field_errors in star_errors)
+    return Error(stars, lost, *map(rounded, (arcsec, mag, cross, roll)))
 
 
 def rms_of_known(values: Sequence[float]) -> float:

@@ -129,6 +129,15 @@ class StudyTracker(Closing):
         """Electrons (h, w) of an exposure to the mean light of a monitor (H, W)."""
         return self.optics.image_e_per_s(light_e_per_s) * seen.length_s
 
+    def sees_around(self, x_px: FloatArray, y_px: FloatArray, margin_px: float) -> BoolArray:
+        """Whether the surroundings of places are on the detector and on the monitor."""
+        on_detector = within(x_px, y_px, self.camera.resolution_px, margin_px)
+        monitor_x, monitor_y = self.geometry.to_monitor(x_px.ravel(), y_px.ravel())
+        reach_px = self.bench.psf.footprint_px / 2 + margin_px * self.monitor_px_per_px
+        size_px = self.bench.camera.resolution_px
+        on_monitor = within(monitor_x, monitor_y, size_px, reach_px).reshape(x_px.shape)
+        return np.asarray(on_detector & on_monitor)
+
     def close(self) -> None:
         """Free the GL context."""
         self.optics.close()
@@ -166,7 +175,7 @@ class StarJudge:
         if movement.turns:
             places_px = self._paths()
             margin_px = self._reach_px + 1
-        inside = np.atleast_2d(self._inside(*places_px, margin_px)).all(axis=0)
+        inside = np.atleast_2d(tracker.sees_around(*places_px, margin_px)).all(axis=0)
         if not (self._wanted & inside).any():
             return
         self._wanted &= inside
@@ -261,16 +270,6 @@ class StarJudge:
         rays = self.tracker.camera.rays(by_x / divisor, by_y / divisor)
         directions = np.where(is_lit[:, None], normalise(rays), np.nan)
         return MeasuredStars(directions, np.where(is_lit, total, 0.0))
-
-    def _inside(self, x_px: FloatArray, y_px: FloatArray, margin_px: float) -> BoolArray:
-        """Whether the surroundings of places are on the detector and on the monitor."""
-        tracker = self.tracker
-        on_detector = within(x_px, y_px, tracker.camera.resolution_px, margin_px)
-        monitor_x, monitor_y = tracker.geometry.to_monitor(x_px.ravel(), y_px.ravel())
-        reach_px = tracker.bench.psf.footprint_px / 2 + margin_px * tracker.monitor_px_per_px
-        size_px = tracker.bench.camera.resolution_px
-        on_monitor = within(monitor_x, monitor_y, size_px, reach_px).reshape(x_px.shape)
-        return np.asarray(on_detector & on_monitor)
 
 
 def within(

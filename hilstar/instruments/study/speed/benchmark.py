@@ -344,6 +344,9 @@ def _keep_image(
     images[name] = draw()
 
 
+CellKey = tuple[int, int, int]  # width and height, px, and the number of stars
+
+
 class CellMeasurement(Closing):
     """One image size and star count, measured into `result`; close it to free its two GL
     contexts.
@@ -377,15 +380,17 @@ class CellMeasurement(Closing):
         }
         images: dict[str, Float32Array] = {}
         for name, draw in methods.items():
-            why = self._too_long(draw, budget_s)
+            of_stars = self._of_stars(draw)
+            why = too_long(of_stars, self.sprites, budget_s)
             if why is not None:
                 skipped = report.Skipped(*self.cell_key, name, why)
                 self.result.skipped.append(skipped)
                 continue
-            whole = partial(draw, self.sprites, self.sigma_px, self.shape)
-            works[name] = partial(_keep_image, images, name, whole)
+            works[name] = partial(_keep_image, images, name, partial(of_stars, self.sprites))
         times_ms = interleaved(works, rounds, budget_s)
-        self._keep(times_ms)
+        rows, python = cell_times(self.cell_key, times_ms, self.stage_ms)
+        self.result.rows += rows
+        self.result.python_ms.append(python)
         ours = self._draw_linear()
         for name, image in images.items():
             off = np.abs(image - ours).max()
@@ -393,49 +398,9 @@ class CellMeasurement(Closing):
             agreement = report.Agreement(*self.cell_key, name, worst)
             self.result.agreement.append(agreement)
 
-    def _keep(self, times_ms: dict[str, list[float]]) -> None:
-        python_ms = _spread(times_ms.pop("python"))
-        python = report.PythonTime(*self.cell_key, python_ms)
-        self.result.python_ms.append(python)
-        del times_ms["stages"]  # with its waits; its parts are kept
-        rows = []
-        for kind in report.OF_AN_IMAGE:
-            rows.append(("hilstar", kind, times_ms.pop(kind)))
-        for kind in (*STAGES, *GPU_STAGES):
-            stage_ms = self.stage_ms.get(kind)
-            if stage_ms:
-                # without the first turn, as in `interleaved`
-                rows.append(("hilstar", kind, stage_ms[1:] or stage_ms))
-        for name, method_ms in times_ms.items():
-            rows.append((name, "linear_only", method_ms))
-        for method, kind, kind_ms in rows:
-            spread_ms = _spread(kind_ms)
-            timing = report.MethodTiming(*self.cell_key, method, kind, spread_ms)
-            self.result.rows.append(timing)
-
-    def _too_long(self, draw: Draw, budget_s: float) -> str | None:
-        """Why a method is skipped here, or None.
-
-        Its time for all stars is estimated from that for one star and for a hundred more.
-        """
-        if len(self.sprites) <= 101:
-            return None
-
-        def fastest_s(count: int) -> float:
-            few = {}
-            for name in ("data", "star", "x_px", "y_px"):
-                few[name] = getattr(self.sprites, name)[:count]
-            part = replace(self.sprites, **few)
-            work = partial(draw, part, self.sigma_px, self.shape)
-            return min(_seconds(work), _seconds(work))
-
-        one_s = fastest_s(1)
-        hundred_s = fastest_s(101) - one_s
-        star_s = hundred_s / 100
-        frame_s = one_s + star_s * len(self.sprites)
-        if frame_s > budget_s:
-            return f"n/a: about {frame_s:.0f} s a frame, over the budget of {budget_s:g} s"
-        return None
+    def _of_stars(self, draw: Draw) -> Callable[[FrameLight], Float32Array]:
+        """A method that is asked for stars alone."""
+        return lambda sprites: draw(sprites, self.sigma_px, self.shape)
 
     def _draw_linear(self) -> Float32Array:
         self.linear.draw(self.sprites)
@@ -483,6 +448,56 @@ class CellMeasurement(Closing):
         """Free the GL contexts."""
         self.staged.close()
         self.linear.close()
+
+
+def cell_times(
+    cell_key: CellKey, times_ms: dict[str, list[float]], stages_ms: dict[str, list[float]]
+) -> tuple[list[report.MethodTiming], report.PythonTime]:
+    """A cell's rows: of hilstar's images, of their stages and of the other methods; and the time
+    outside OpenGL.
+    """
+    named = []
+    for kind in report.OF_AN_IMAGE:
+        named.append(("hilstar", kind, times_ms[kind]))
+    for kind in (*STAGES, *GPU_STAGES):
+        stage_ms = stages_ms.get(kind)
+        if stage_ms:
+            # without the first turn, as in `interleaved`
+            named.append(("hilstar", kind, stage_ms[1:] or stage_ms))
+    for name, method_ms in times_ms.items():
+        # "stages" has its waits in it; its parts are kept
+        if name not in (*report.OF_AN_IMAGE, "stages", "python"):
+            named.append((name, "linear_only", method_ms))
+    rows = []
+    for method, kind, kind_ms in named:
+        rows.append(report.MethodTiming(*cell_key, method, kind, _spread(kind_ms)))
+    return rows, report.PythonTime(*cell_key, _spread(times_ms["python"]))
+
+
+def too_long(
+    draw: Callable[[FrameLight], object], sprites: FrameLight, budget_s: float
+) -> str | None:
+    """Why a method is skipped for these stars, or None.
+
+    Its time for all of them is estimated from that for one and for a hundred more.
+    """
+    if len(sprites) <= 101:
+        return None
+
+    def fastest_s(count: int) -> float:
+        few = {}
+        for name in ("data", "star", "x_px", "y_px"):
+            few[name] = getattr(sprites, name)[:count]
+        work = partial(draw, replace(sprites, **few))
+        return min(_seconds(work), _seconds(work))
+
+    one_s = fastest_s(1)
+    hundred_s = fastest_s(101) - one_s
+    star_s = hundred_s / 100
+    frame_s = one_s + star_s * len(sprites)
+    if frame_s > budget_s:
+        return f"n/a: about {frame_s:.0f} s a frame, over the budget of {budget_s:g} s"
+    return None
 
 
 def interleaved(

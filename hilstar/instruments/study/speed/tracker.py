@@ -7,8 +7,9 @@ the finders of photutils and sep on hilstar's own DN.
 """
 
 import os
-from collections.abc import Callable
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,6 +17,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import numpy.typing as npt
 
+from hilstar.basics.arrays import FloatArray
 from hilstar.basics.resources import resource_path
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.instruments.campaign.job import Job, files_sha256
@@ -24,10 +26,12 @@ from hilstar.instruments.campaign.session import OWN_THREADS, Session
 from hilstar.instruments.campaign.solvers import CENTROIDS
 from hilstar.instruments.simulate.simulator import Exposure, Simulator
 from hilstar.instruments.study.speed.report import Cell, MethodTiming, Skipped, TimeSpread
-from hilstar.instruments.study.sweep import in_turn
+from hilstar.instruments.study.sweep import Spent, in_turn
+from hilstar.instruments.study.trials import called
 from hilstar.instruments.verify.summary import verify
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
 from hilstar.tracker.centroids import find_stars
+from hilstar.tracker.settings import DetectorSettings
 
 RADEC_ROLL_DEG = (84.057, -1.2, 10.0)
 SEED = 1
@@ -35,6 +39,7 @@ PLAN = f'bench = "demo.toml"\ncases = 1000\nseed = {SEED}\n'
 KINDS = ("exposure", "find_stars", "case", "verify")
 FINDER_SIGMAS, FWHM_PX = 5.0, 2.0
 Work = Callable[[], object]
+WorkKey = tuple[str, str]  # a program and a kind
 
 
 class Exposing:
@@ -55,13 +60,8 @@ class Exposing:
         self.simulator.expose(self.view, self.rng)
 
     def numpy_noise(self) -> npt.NDArray[np.uint16]:
-        """NumPy's own draws: Poisson, normal read noise; DN (h, w)."""
-        mean_e = self.exposure.mean_e
-        charge = self.rng.poisson(mean_e) + self.rng.normal(
-            0.0, self.detector.read_noise_e, mean_e.shape
-        )
-        dn = np.rint(charge / self.detector.gain_e_per_dn)
-        return np.clip(dn, 0, 2**self.detector.bits - 1).astype(np.uint16)
+        """NumPy's own draws of the same exposure."""
+        return numpy_dn(self.exposure.mean_e, self.detector, self.rng)
 
     def galsim_noise(self) -> Work:
         """GalSim's CCD noise on the same image. Raises ImportError."""
@@ -118,14 +118,60 @@ class Exposing:
         )
 
 
+def numpy_dn(
+    mean_e: FloatArray, detector: DetectorSettings, rng: np.random.Generator
+) -> npt.NDArray[np.uint16]:
+    """NumPy's draws of an image (h, w): Poisson, normal read noise; DN."""
+    charge = rng.poisson(mean_e) + rng.normal(0.0, detector.read_noise_e, mean_e.shape)
+    dn = np.rint(charge / detector.gain_e_per_dn)
+    return np.clip(dn, 0, 2**detector.bits - 1).astype(np.uint16)
+
+
+@contextmanager
+def threads_unset() -> Iterator[None]:
+    """What a campaign's worker sets for its process is unset again."""
+    unset = [name for name in OWN_THREADS if name not in os.environ]
+    try:
+        yield
+    finally:
+        for name in unset:
+            os.environ.pop(name, None)
+
+
+def peer_works(
+    peers: Mapping[WorkKey, Callable[[], Work]],
+) -> tuple[dict[WorkKey, Work], list[Skipped]]:
+    """The works of the peers that are installed, and why the others are skipped."""
+    works = {}
+    skipped = []
+    for (name, kind), make in peers.items():
+        try:
+            works[name, kind] = make()
+        except ImportError as error:
+            why = f"{kind}: not installed ({error}): pip install 'hilstar[benchmark]'"
+            skipped.append(Skipped(method=name, why=why))
+    return works, skipped
+
+
+def tracker_timings(times: Mapping[WorkKey, Sequence[Spent]], cell: Cell) -> list[MethodTiming]:
+    """Rows of processor times, by KINDS, hilstar's first."""
+    rows = []
+    for name, kind in sorted(
+        times, key=lambda each: (KINDS.index(each[1]), each[0] != "hilstar", each[0])
+    ):
+        ms = [timing.cpu_ms for timing in times[name, kind]]
+        spread = TimeSpread(float(np.median(ms)), min(ms), max(ms))
+        rows.append(MethodTiming(cell.width, cell.height, cell.stars, name, kind, spread))
+    return rows
+
+
 def tracker_rows(rounds: int, budget_s: float) -> tuple[list[MethodTiming], list[Skipped]]:
     """Processor times of each work in turn, and the peers that are not installed. Raises
     InputError, MachineError.
     """
-    unset = [name for name in OWN_THREADS if name not in os.environ]
     file = read_bench_file(resource_path("configs", "demo.toml"))
-    skipped: list[Skipped] = []
     with ExitStack() as stack:
+        stack.enter_context(threads_unset())
         folder = stack.enter_context(TemporaryDirectory())
         exposing = Exposing(file, Path(folder))
         stack.callback(exposing.simulator.close)
@@ -137,7 +183,7 @@ def tracker_rows(rounds: int, budget_s: float) -> tuple[list[MethodTiming], list
             exposing.case += 1
             session.row(exposing.case, points[exposing.case % len(points)])
 
-        works: dict[tuple[str, str], Work] = {
+        works: dict[WorkKey, Work] = {
             ("hilstar", "exposure"): exposing.expose,
             ("numpy", "exposure"): exposing.numpy_noise,
             ("hilstar", "find_stars"): lambda: find_stars(exposing.exposure.dn),
@@ -146,34 +192,20 @@ def tracker_rows(rounds: int, budget_s: float) -> tuple[list[MethodTiming], list
                 file, 1, np.random.default_rng(SEED), lambda done: None
             ),
         }
-        peers: dict[tuple[str, str], Callable[[], Work]] = {
-            ("galsim", "exposure"): exposing.galsim_noise,
-            ("photutils", "find_stars"): exposing.photutils_stars,
-            ("sep", "find_stars"): exposing.sep_stars,
-        }
-        for (name, kind), make in peers.items():
-            try:
-                works[name, kind] = make()
-            except ImportError as error:
-                skipped.append(
-                    Skipped(
-                        method=name,
-                        why=f"{kind}: not installed ({error}): pip install 'hilstar[benchmark]'",
-                    )
-                )
-        by_name = {}
-        for (name, kind), work in works.items():
-            by_name[f"{name} {kind}"] = lambda turn, work=work: work()
+        of_peers, skipped = peer_works(
+            {
+                ("galsim", "exposure"): exposing.galsim_noise,
+                ("photutils", "find_stars"): exposing.photutils_stars,
+                ("sep", "find_stars"): exposing.sep_stars,
+            }
+        )
+        by_name: dict[str, Callable[[int], object]] = {}
+        keys = {}
+        for (name, kind), work in (works | of_peers).items():
+            by_name[f"{name} {kind}"] = partial(called, work)
+            keys[f"{name} {kind}"] = name, kind
         times = in_turn(by_name, rounds, budget_s)
         width, height = file.config.tracker.resolution_px
         cell = Cell(width, height, len(exposing.exposure.truth))
-    for name in unset:  # a campaign's worker sets them for its process
-        os.environ.pop(name, None)
-    rows = []
-    for name, kind in sorted(
-        works, key=lambda each: (KINDS.index(each[1]), each[0] != "hilstar", each[0])
-    ):
-        ms = [timing.cpu_ms for timing in times[f"{name} {kind}"]]
-        spread = TimeSpread(float(np.median(ms)), min(ms), max(ms))
-        rows.append(MethodTiming(cell.width, cell.height, cell.stars, name, kind, spread))
-    return rows, skipped
+    timed = {keys[name]: spent for name, spent in times.items()}
+    return tracker_timings(timed, cell), skipped

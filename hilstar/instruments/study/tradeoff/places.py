@@ -321,6 +321,15 @@ def culling(stack: ExitStack, quick: bool) -> Trials:
     )
 
 
+def stars_near(stars: Stars, turns: Sequence[FloatArray], radius_rad: float) -> list[FloatArray]:
+    """The directions (k, 3) of the stars near each boresight."""
+    near = []
+    for turn in turns:
+        star = stars.grid.near(turn[2], radius_rad)
+        near.append(stars.vectors[star])
+    return near
+
+
 def projection(stack: ExitStack, quick: bool) -> Trials:
     """Errors of star places, px, by number format: largest and rms over the stars of ATTITUDES
     fields.
@@ -330,11 +339,7 @@ def projection(stack: ExitStack, quick: bool) -> Trials:
     stars = stars_to(NO_LIMIT_V_MAG)
     field_count = 6 if quick else ATTITUDES
     turns = random_turns(field_count, camera)
-    radius_rad = camera.field_radius_rad(0.0)
-    near = []
-    for turn in turns:
-        star = stars.grid.near(turn[2], radius_rad)
-        near.append(stars.vectors[star])
+    near = stars_near(stars, turns, camera.field_radius_rad(0.0))
     truth = places_in_fields(EXACT, near, turns, camera)
     trials = []
     for name, road in ROADS.items():
@@ -438,15 +443,23 @@ def smear_bench() -> SmearBench:
 def smear_methods(bench: SmearBench) -> dict[str, SpritesOf]:
     """Every fixed number of sprites on a path, by Gauss-Legendre quadrature and evenly in time."""
     methods: dict[str, SpritesOf] = {}
+    for name, (at, share) in path_nodes().items():
+        methods[name] = partial(bench.chain, at, share)
+    return methods
+
+
+def path_nodes() -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Where the sprites of each method stand on a path from -1/2 to 1/2 (n,), and their shares of
+    its light.
+    """
+    placed = {}
     for count in (*GAUSS, EXACT_NODES):
         nodes, weights = np.polynomial.legendre.leggauss(count)
-        methods[gauss_name(count)] = partial(bench.chain, nodes / 2, weights / 2)
+        placed[gauss_name(count)] = nodes / 2, weights / 2
     for count in EVENLY:
         number = np.arange(count) + 0.5
-        at = number / count - 0.5
-        share = np.full(count, 1 / count)
-        methods[f"evenly in time, {count}"] = partial(bench.chain, at, share)
-    return methods
+        placed[f"evenly in time, {count}"] = number / count - 0.5, np.full(count, 1 / count)
+    return placed
 
 
 def gauss_name(count: int) -> str:
@@ -522,6 +535,12 @@ def attitudes_at(attitude_at: AttitudeAt, times_ns: Sequence[int]) -> None:
         attitude_at(t_ns)
 
 
+def moments_ns(samples: Sequence[AttitudeSample]) -> list[int]:
+    """The moments whose attitudes are timed: from the last sample but one to the last."""
+    after_ns = np.linspace(0, SAMPLE_MS * NS_PER_MS, PREDICTIONS, dtype=np.int64)
+    return list(map(int, after_ns + samples[-2].t_ns))
+
+
 def prediction(stack: ExitStack, quick: bool) -> Trials:
     """The attitude at the moment of light, after the newest sample: worst and rms error, arcsec,
     on a shaken slew.
@@ -533,8 +552,7 @@ def prediction(stack: ExitStack, quick: bool) -> Trials:
     for number in range(count):
         t_ns = number * SAMPLE_MS * NS_PER_MS
         samples.append(slew_sample(t_ns))
-    after_ns = np.linspace(0, SAMPLE_MS * NS_PER_MS, PREDICTIONS, dtype=np.int64)
-    times_ns = (after_ns + samples[-2].t_ns).tolist()
+    times_ns = moments_ns(samples)
     trials = []
     for predictor in predictors():
         errors = prediction_errors(predictor, samples)

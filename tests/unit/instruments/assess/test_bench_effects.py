@@ -5,7 +5,6 @@ stars and answers that all differ.
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -26,11 +25,13 @@ from hilstar.instruments.assess.bench_effects import (
     slices_of,
 )
 from hilstar.instruments.simulate.noise import field_stars
+from hilstar.instruments.simulate.star_finder import Matched
 from hilstar.optics.camera import Camera
 from hilstar.server.answers.answer import ReportedStar
 from hilstar.server.bench.bench_file import BenchFile, bench_file_of
 from hilstar.server.bench.cameras import tracker_camera
 from hilstar.server.bench.star_light import bench_stars
+from hilstar.tracker.centroids import Centroids
 from tests.support.benches import bench_text
 from tests.support.planted_tracker import attitude, scalar_first
 
@@ -46,9 +47,11 @@ def turned_places(x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, Float
     return x + 599.5, y + 349.5
 
 
-def matched(x_px: FloatArray, y_px: FloatArray, index: list[int], flux: FloatArray) -> Any:
-    found = SimpleNamespace(x_px=x_px, y_px=y_px, flux=flux)
-    return SimpleNamespace(found=found, index=np.array(index))
+def matched(x_px: FloatArray, y_px: FloatArray, index: list[int], flux: FloatArray) -> Matched:
+    count = len(flux)
+    inside = np.zeros(count, dtype=bool)
+    found = Centroids(x_px, y_px, flux, flux, np.full(count, 9), inside)
+    return Matched(found, np.array(index))
 
 
 def test_a_display_s_turn_is_that_of_the_stars_found_in_both(rng):

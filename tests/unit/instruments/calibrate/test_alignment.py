@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -44,6 +43,8 @@ from hilstar.instruments.calibrate.attitude_pairs import (
     _angles_to,
     _weights,
 )
+from hilstar.server.bench.bench_file import read_bench_file
+from tests.support.benches import bench_text
 from tests.support.refusals import refusal
 
 CAMERA = monitor_camera(
@@ -144,7 +145,7 @@ def test_one_attitude_determines_the_rotation_and_the_summary_says_what_it_canno
     assert np.abs(
         np.subtract(found.rotation_arcsec, PLANTED_ARCSEC) / NOISE_ARCSEC
     ).max() < SIGMAS / np.sqrt(20)
-    assert any("one attitude" in note for note in remarks_of(found))
+    assert any("one attitude" in note for note in remarks_of(found.residual))
 
 
 def test_what_goes_with_attitude_is_told_from_noise_by_repeats(rng):
@@ -160,7 +161,8 @@ def test_what_goes_with_attitude_is_told_from_noise_by_repeats(rng):
     assert found.residual.unexplained.cross == pytest.approx(30.0, rel=0.35)
     assert found.residual.unexplained.roll == pytest.approx(100.0, rel=0.35)
     assert any(
-        "a rotation does not explain" in note and "dots" in note for note in remarks_of(found)
+        "a rotation does not explain" in note and "dots" in note
+        for note in remarks_of(found.residual)
     )
     assert not found.residual.causes
     assert min(found.sigma_arcsec) > 30 / np.sqrt(40) / 1.5  # the attitudes count, not the pairs
@@ -388,11 +390,11 @@ def test_what_a_rotation_does_not_explain_is_said_across_and_about_the_boresight
 ):
     some = AxesArcsec(1.0, 2.0)
     residual = Residual(some, some, AxesArcsec(cross, roll), 8, ("a cause",))
-    remark, cause = remarks_of(SimpleNamespace(residual=residual))
+    remark, cause = remarks_of(residual)
     assert remark.startswith(f"a rotation does not explain {words}: calibrate the geometry")
     assert cause == "a cause"
     explained = Residual(some, some, AxesArcsec(0.0, 0.0), 8, ())
-    assert remarks_of(SimpleNamespace(residual=explained)) == ()
+    assert remarks_of(explained) == ()
 
 
 @pytest.mark.parametrize("skipped", [0, 6])
@@ -419,15 +421,16 @@ def test_an_alignment_s_figures_are_alike_in_lines_summary_and_file(tmp_path, rn
     assert f"x {x:.2f} +- {of_x:.2f}, y {y:.2f} +- {of_y:.2f}" in text
     assert f"about the boresight {z:.2f} +- {of_z:.2f} arcsec" in text
     assert lines
-    file = SimpleNamespace(config=SimpleNamespace(collimator=SimpleNamespace(geometry=None)))
+    bench = tmp_path / "bench.toml"
+    bench.write_text(bench_text())
     path = tmp_path / "geometry.toml"
     first, second = (MonitorIdentity(maker="ACM", serial=serial) for serial in ("1", "2"))
-    write_alignment(path, found, file, first)
+    write_alignment(path, found, read_bench_file(bench), first)
     notes = load_notes(path)
     assert notes.identity == first
     # a later alignment stands before the monitor that it sees, or before the file's own
-    collimator = SimpleNamespace(geometry=path.name)
-    filed = SimpleNamespace(config=SimpleNamespace(collimator=collimator), folder=tmp_path)
+    bench.write_text(bench_text({"collimator": {"geometry": path.name}}))
+    filed = read_bench_file(bench)
     for identity, wanted in ((second, second), (None, first)):
         write_alignment(tmp_path / "again.toml", found, filed, identity)
         assert load_notes(tmp_path / "again.toml").identity == wanted

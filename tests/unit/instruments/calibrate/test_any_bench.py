@@ -31,10 +31,14 @@ from hilstar.instruments.calibrate.first_light.geometry import UPRIGHT, figure_f
 from hilstar.instruments.calibrate.first_light.image_sources import ImageSource
 from hilstar.instruments.calibrate.first_light.photometry import rounds_alike
 from hilstar.instruments.calibrate.first_light.seen_stars import Beyond, StarSpot
-from hilstar.instruments.calibrate.first_light.session import FirstLightSession, Progress
+from hilstar.instruments.calibrate.first_light.session import (
+    NAMES,
+    FirstLightSession,
+    Progress,
+    SessionPlan,
+)
 from hilstar.instruments.calibrate.first_light.stars import (
     P95_OF_TWO,
-    frames_for,
     noise_words,
     place_reasons,
 )
@@ -46,12 +50,7 @@ from hilstar.instruments.calibrate.geometric.dots import (
     lit_for,
     plan_seen_dots,
 )
-from hilstar.instruments.calibrate.geometric.fit import (
-    BROWN_CONRADY,
-    MatchedDots,
-    Model,
-    held_out,
-)
+from hilstar.instruments.calibrate.geometric.fit import BROWN_CONRADY, MatchedDots, Model, held_out
 from hilstar.instruments.calibrate.geometric.geometry_fit import (
     calibrate_seen,
     matched,
@@ -61,7 +60,6 @@ from hilstar.instruments.calibrate.geometric.geometry_fit import (
 )
 from hilstar.instruments.calibrate.geometric.match import first_look
 from hilstar.instruments.calibrate.geometric.observed import Observed, dot_centroids
-from hilstar.instruments.calibrate.scale import StarReading, scale_of
 from hilstar.instruments.certify.readings import dot_settings
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.instruments.simulate.optics import TwinOptics
@@ -290,45 +288,36 @@ def test_the_virtual_tracker_s_wide_pixel_is_as_sharp_as_its_psf():
     assert abs(found.psf_sigma_px - 0.55) < 4 * found.psf_sigma_error_px < 0.03
 
 
-def test_no_step_is_done_with_a_figure_at_an_end_of_its_model():
-    outcome = StepOutcome(
-        "done", "PSF sigma 0.1 px", fitted=(FittedFigure("PSF sigma", 0.1, 0.1, 12.0),)
-    )
-    checked = outcome.checked()
-    assert checked.verdict == "failed"
-    assert "PSF sigma 0.1 is at an end of its model (0.1 to 12)" in checked.line
-    inside = StepOutcome("done", "", fitted=(FittedFigure("PSF sigma", 0.11, 0.1, 12.0),))
-    assert inside.checked() is inside
-
-
 class Dark(ImageSource):
     """A source that shows nothing."""
 
     identity, sets_exposure = "dark", True
 
 
-def test_a_session_holds_every_step_to_the_ends_of_its_model(tmp_path, monkeypatch):
+def ran(folder, runs):
+    """A session whose steps come to these outcomes, and its exit code."""
+    (folder / "bench.toml").write_text(bench_text())
+    (folder / "s").mkdir()
+    file = read_bench_file(folder / "bench.toml")
+    session = FirstLightSession(folder / "s", file, Dark(), 0, plan=SessionPlan(runs=runs))
+    return session, session.run(frozenset(), lambda line: None)
+
+
+def test_a_session_holds_every_step_to_the_ends_of_its_model(tmp_path):
     at_end = StepOutcome("done", "found", fitted=(FittedFigure("tilt", -60.0, -60.0, 60.0),))
-    monkeypatch.setattr(sessions, "RUNS", {name: lambda context: at_end for name in sessions.NAMES})
-    (tmp_path / "bench.toml").write_text(bench_text())
-    session = FirstLightSession(tmp_path / "s", read_bench_file(tmp_path / "bench.toml"), Dark(), 0)
-    (tmp_path / "s").mkdir()
-    assert session.run(frozenset(), lambda line: None) == 1
+    session, code = ran(tmp_path, {name: lambda context: at_end for name in NAMES})
+    assert code == 1
     assert {record.verdict for record in session.records.values()} <= {"failed", "skipped"}
 
 
 @pytest.mark.parametrize(
     ("photometry", "scale"), [("done", "done"), ("skipped", "done"), ("failed", "skipped")]
 )
-def test_no_scale_is_done_by_a_response_that_failed(tmp_path, monkeypatch, photometry, scale):
+def test_no_scale_is_done_by_a_response_that_failed(tmp_path, photometry, scale):
     """White was 0.167 mag off with 0.016 stated, by stars in a response that was not measured."""
-    runs = {name: lambda context: StepOutcome("done", "found") for name in sessions.NAMES}
+    runs = {name: lambda context: StepOutcome("done", "found") for name in NAMES}
     runs["photometry"] = lambda context: StepOutcome(photometry, "so it ended")
-    monkeypatch.setattr(sessions, "RUNS", runs)
-    (tmp_path / "bench.toml").write_text(bench_text())
-    (tmp_path / "s").mkdir()
-    session = FirstLightSession(tmp_path / "s", read_bench_file(tmp_path / "bench.toml"), Dark(), 0)
-    session.run(frozenset(), lambda line: None)
+    session, _ = ran(tmp_path, runs)
     assert session.records["scale"].verdict == scale
 
 
@@ -489,9 +478,7 @@ def test_the_noise_of_a_whole_catalogue_s_stars_is_that_of_each_and_takes_no_min
     each_mag = spot.light_noise_mag(few_dn, noise_dn)
     rounded = []
     monkeypatch.setattr(
-        seen_stars,
-        "rounded_light",
-        lambda *given: rounded.append(given) or rounded_light(*given),
+        seen_stars, "rounded_light", lambda *given: rounded.append(given) or rounded_light(*given)
     )
     catalogue_dn = np.concatenate([few_dn, [0.4], np.geomspace(0.5, largest_dn, 100_000)])
     noise_mag = spot.tabled_noise_mag(catalogue_dn, noise_dn, largest_dn)
@@ -501,42 +488,13 @@ def test_the_noise_of_a_whole_catalogue_s_stars_is_that_of_each_and_takes_no_min
     assert noise_mag[4] == math.inf
 
 
-def test_what_is_beyond_noise_is_told_from_noise():
-    rng = np.random.default_rng(5)
-    noise = rng.uniform(0.05, 0.4, 200)
-    alone, more = (Beyond.of(rng.normal(0, np.hypot(noise, extra)), noise) for extra in (0.0, 0.3))
-    assert alone.low == 0.0
-    assert alone.high < 0.1
-    assert more.low < 0.3 < more.high
-    assert more.low > 0.2
-
-
-class Distances:
-    """Stars `off_px` from the sky along x and y, with noise along each axis, for `noise_words`."""
-
-    def __init__(self, off_px, noise_px):
-        self.residual_px, self.place_noise_px = np.full((4, 2), off_px), np.full(4, noise_px)
-
-
 def test_noise_is_never_said_to_be_more_than_the_whole():
     """A line said that stars were 0.081 px off, of which noise was 0.086."""
-    assert noise_words(Distances(0.1, 0.05)) == "of which noise is 0.071 px"
-    assert noise_words(Distances(0.05, 0.06)) == "no more than their noise makes (0.085 px)"
-
-
-class Places:
-    """The places of stars, for `frames_for`."""
-
-    def __init__(self, beyond, frames=1):
-        self.beyond_px, self.frames = beyond, frames
-
-
-def test_frames_are_asked_for_where_noise_hides_the_places():
-    limit_px = 0.1
-    sigma = limit_px / P95_OF_TWO
-    assert frames_for(Places(Beyond(0.0, 0.0, 0.9 * sigma)), limit_px) == 1
-    assert frames_for(Places(Beyond(3 * sigma, 2 * sigma, 4 * sigma)), limit_px) == 1
-    assert frames_for(Places(Beyond(0.0, 0.0, 3 * sigma)), limit_px) == 9
+    for off_px, noise_px, words in (
+        (0.1, 0.05, "of which noise is 0.071 px"),
+        (0.05, 0.06, "no more than their noise makes (0.085 px)"),
+    ):
+        assert noise_words(np.full((4, 2), off_px), np.full(4, noise_px)) == words
 
 
 @pytest.mark.parametrize(
@@ -544,19 +502,10 @@ def test_frames_are_asked_for_where_noise_hides_the_places():
 )
 def test_no_more_frames_are_advised_than_the_option_takes(high, advised):
     limit_px = 0.1
-    (reason,) = place_reasons(Places(Beyond(0.0, 0.0, high * limit_px / P95_OF_TWO)), limit_px)
+    (reason,) = place_reasons(Beyond(0.0, 0.0, high * limit_px / P95_OF_TWO), 1, limit_px)
     assert advised in reason
     assert ("--average" in reason) == bool(advised)
     assert "a longer [tracker] exposure_s" in reason
-
-
-def test_a_noisy_reading_counts_less_and_equal_ones_are_their_median():
-    ratios = np.array([1.0, 1.02, 0.98, 2.0])
-    assert scale_of(10.0, ratios, np.zeros(4)).flux_at_white_e_per_s == pytest.approx(10.1)
-    weighed = scale_of(10.0, ratios, np.array([0.01, 0.01, 0.01, 0.5]))
-    assert weighed.flux_at_white_e_per_s == pytest.approx(10.0, abs=0.06)
-    assert weighed.relative_error is not None
-    assert StarReading(1, 5.0).sigma_dn == 0.0
 
 
 def test_dots_of_a_certificate_stand_close_and_are_measured_all_the_same():

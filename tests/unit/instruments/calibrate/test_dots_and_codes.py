@@ -9,7 +9,6 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -457,7 +456,8 @@ def test_a_dot_at_two_places_is_refused_whichever_axis_it_moves_along(tmp_path, 
 
 def test_poses_are_told_by_places_over_the_middle_of_the_dots():
     """Dots over 100 to 600 px and 40 to 90 px: four columns and rows over the middle 60 %."""
-    plan = SimpleNamespace(x_px=np.array([600.0, 100, 300]), y_px=np.array([40.0, 80, 90]))
+    x_px, y_px = np.array([600.0, 100, 300]), np.array([40.0, 80, 90])
+    plan = DotPlan(x_px, y_px, np.ones((3, 1), dtype=bool))
     x_px, y_px = _middle_places(plan)
     assert sorted({round(x, 6) for x in x_px.tolist()}) == [200, 300, 400, 500]
     assert sorted({round(y, 6) for y in y_px.tolist()}) == [50, 60, 70, 80]

@@ -116,12 +116,7 @@ def matched(x_px: np.ndarray, y_px: np.ndarray, dot: np.ndarray) -> MatchedDots:
 
 
 @pytest.mark.parametrize(
-    "matrix",
-    [
-        [[2.0, 0.0], [0.0, 0.5]],
-        [[0.0, -2.0], [2.0, 0.0]],
-        [[1.5, 0.7], [-0.3, 0.9]],
-    ],
+    "matrix", [[[2.0, 0.0], [0.0, 0.5]], [[0.0, -2.0], [2.0, 0.0]], [[1.5, 0.7], [-0.3, 0.9]]]
 )
 @pytest.mark.parametrize("count", [20, 60])
 def test_a_dot_s_side_is_the_root_of_its_map_s_area(matrix, count, rng):

@@ -19,7 +19,6 @@ from hilstar.basics.errors import InputError
 from hilstar.display.geometry import monitor_camera
 from hilstar.display.window import window as windows
 from hilstar.instruments.calibrate.first_light import image_sources
-from hilstar.instruments.calibrate.first_light import session as sessions
 from hilstar.instruments.calibrate.first_light.context import KeyChange, StepOutcome, rewrite
 from hilstar.instruments.calibrate.first_light.focus import sharpness
 from hilstar.instruments.calibrate.first_light.geometry import (
@@ -45,7 +44,11 @@ from hilstar.instruments.calibrate.first_light.image_sources import (
     off_screen,
     on_screen,
 )
-from hilstar.instruments.calibrate.first_light.session import FirstLightSession, SessionStep
+from hilstar.instruments.calibrate.first_light.session import (
+    FirstLightSession,
+    SessionPlan,
+    SessionStep,
+)
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.optics.scan import Orientation
 from hilstar.server.bench.bench_file import read_bench_file
@@ -408,16 +411,14 @@ class Blind(ImageSource):
 class Counted:
     """Steps that count how often they ran; `failing` are refused."""
 
-    def __init__(self, monkeypatch):
+    def __init__(self):
         self.runs, self.failing = [], set()
         steps = (
             SessionStep("", "", "", name="first", tables=("monitor",), writes=("monitor.flip_x",)),
             SessionStep("", "", "", name="second", needs=("first",), tables=("monitor",)),
             SessionStep("", "", "", name="third", tables=("collimator",)),
         )
-        monkeypatch.setattr(sessions, "STEPS", steps)
-        monkeypatch.setattr(sessions, "RUNS", {step.name: self.step(step.name) for step in steps})
-        monkeypatch.setattr(sessions, "NAMES", tuple(step.name for step in steps))
+        self.plan = SessionPlan(steps, {step.name: self.step(step.name) for step in steps})
 
     def step(self, name):
         def run(context):
@@ -438,17 +439,16 @@ class Counted:
 
     def go(self, folder, again=()):
         self.runs.clear()
-        session = FirstLightSession(
-            folder / "s", read_bench_file(folder / "bench.toml"), Blind(), 0
-        )
+        file = read_bench_file(folder / "bench.toml")
+        session = FirstLightSession(folder / "s", file, Blind(), 0, plan=self.plan)
         return session.run(frozenset(again), lambda line: None), session
 
 
 @pytest.fixture
-def counted(tmp_path, monkeypatch):
+def counted(tmp_path):
     (tmp_path / "bench.toml").write_text(bench_text())
     (tmp_path / "s").mkdir()
-    return Counted(monkeypatch)
+    return Counted()
 
 
 def test_steps_run_once_and_again_when_asked_or_when_what_they_depend_on_changes(counted, tmp_path):
@@ -523,7 +523,7 @@ def test_what_failed_is_never_done_and_what_needs_it_is_skipped(counted, tmp_pat
     assert counted.runs == ["first", "second"]
 
 
-def test_a_camera_that_fails_once_does_not_cost_the_images_before_it(tmp_path, monkeypatch):
+def test_a_camera_that_fails_once_does_not_cost_the_images_before_it(tmp_path):
     """The third image fails until a file is there; then only it and what follows are taken, and
     afterwards nothing is.
     """
@@ -537,11 +537,8 @@ def test_a_camera_that_fails_once_does_not_cost_the_images_before_it(tmp_path, m
             taken.append((path.name, path.stat().st_mtime_ns))
         return StepOutcome("done", "found")
 
-    monkeypatch.setattr(
-        sessions, "STEPS", (SessionStep("", "", "", name="frames", tables=("monitor",)),)
-    )
-    monkeypatch.setattr(sessions, "RUNS", {"frames": frames})
-    monkeypatch.setattr(sessions, "NAMES", ("frames",))
+    step = SessionStep("", "", "", name="frames", tables=("monitor",))
+    plan = SessionPlan((step,), {"frames": frames})
     grab = (
         "sh -c 'cp {pattern} {output}; case {output} in *frame_2*) test -e"
         f" {tmp_path / 'mended'};; esac'"
@@ -549,9 +546,8 @@ def test_a_camera_that_fails_once_does_not_cost_the_images_before_it(tmp_path, m
 
     def go(*again):
         taken.clear()
-        session = FirstLightSession(
-            tmp_path / "s", read_bench_file(tmp_path / "bench.toml"), GrabCommand(grab), 0
-        )
+        file = read_bench_file(tmp_path / "bench.toml")
+        session = FirstLightSession(tmp_path / "s", file, GrabCommand(grab), 0, plan=plan)
         code = session.run(frozenset(again), lambda line: None)
         return code, session.records["frames"].verdict, dict(taken)
 

@@ -6,8 +6,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,17 +13,25 @@ from scipy import stats
 from scipy.special import ndtr
 
 from hilstar.display.calibration import weights_of_grid
-from hilstar.instruments.calibrate.first_light import context, photometry
-from hilstar.instruments.calibrate.first_light import uniformity as uniformities
-from hilstar.instruments.calibrate.first_light.context import FittedFigure, StepContext
-from hilstar.instruments.calibrate.first_light.photometer import Photometer, Range
+from hilstar.instruments.calibrate.first_light.context import FittedFigure
+from hilstar.instruments.calibrate.first_light.photometer import (
+    BLACK,
+    Assumed,
+    LatticeRatio,
+    Photometer,
+    PixelScatter,
+    Range,
+    _Pair,
+    _Reading,
+    _Values,
+)
+from hilstar.instruments.calibrate.first_light.photometry import shares_of_white
 from hilstar.instruments.calibrate.first_light.seen_stars import (
     StarSpot,
     _explained,
     _is_in_image,
     _is_inside,
 )
-from hilstar.instruments.calibrate.first_light.session import STEPS, FirstLightSession
 from hilstar.instruments.calibrate.first_light.stars import (
     LOST_SHARE,
     SYSTEMATIC_MAG,
@@ -47,16 +53,34 @@ from hilstar.instruments.calibrate.first_light.uniformity import (
     _not_negative,
     _shown,
     _smoothness,
-    _spacing,
     draw_uniformity,
+    known_error_mag,
+    spacing_for,
 )
-from hilstar.instruments.calibrate.first_light.uniformity import uniformity as measured_uniformity
 from hilstar.instruments.calibrate.plan import Patch
 from hilstar.instruments.calibrate.scale import MeasuredScale
+from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.optics.camera import Camera
+from tests.support.closed_camera import (
+    EXPOSURE_S,
+    FULL_DN,
+    SIGMA_PX,
+    ClosedCamera,
+    closed_context,
+    power_of,
+)
+from tests.support.seen_stars import stars_seen
+from tests.support.spectra import bump, write_channels, write_panel
 
 MAG_A_RELATIVE = 2.5 / math.log(10)
 SPOT = StarSpot((0.9, 1.4), gain_e_per_dn=4.0, prnu=0.05, electronics_dn=0.0)
+
+
+def camera(size_px: tuple[int, int], focal_length_px: float) -> Camera:
+    """An upright camera about its middle."""
+    width, height = size_px
+    middle_px = ((width - 1) / 2, (height - 1) / 2)
+    return Camera(size_px, focal_length_px, middle_px, np.eye(3))
 
 
 def test_places_are_inside_by_more_than_the_margin_from_the_outermost_pixels():
@@ -66,10 +90,15 @@ def test_places_are_inside_by_more_than_the_margin_from_the_outermost_pixels():
 
 
 def test_directions_are_in_an_image_where_they_are_projected_into_it():
-    camera = Camera((100, 50), 200.0, (49.5, 24.5), np.eye(3))
     tangent = np.array([[0.0, 0.0], [0.19, 0.0], [0.21, 0.0], [0.0, 0.06], [0.0, 0.09]])
     in_cam = np.append(tangent, np.ones((5, 1)), axis=1)
-    assert _is_in_image(camera, in_cam, 10.0).tolist() == [True, True, False, True, False]
+    assert _is_in_image(camera((100, 50), 200.0), in_cam, 10.0).tolist() == [
+        True,
+        True,
+        False,
+        True,
+        False,
+    ]
 
 
 def test_shapes_without_a_share_explain_nothing_on_the_mean(rng):
@@ -136,21 +165,15 @@ def test_a_response_s_noise_is_of_each_pixel_s_own_light():
     assert SPOT.light_noise_mag(dn, 0.0)[0] == pytest.approx(wanted, rel=1e-3)
 
 
-def scale_of_stars(weights, relative_error=0.003) -> MeasuredScale:
-    """A scale by stars of these weights."""
-    values = {"weights": np.array(weights), "relative_error": relative_error}
-    return SimpleNamespace(**values)
-
-
 def test_full_scale_is_as_sure_as_readings_sessions_and_the_adc_together():
     # by phase the weighted means of the stars: 0.01 and -0.02 mag
     rounding_mag = np.array([[0.01, -0.05], [0.01, -0.01]])
     rounding = math.sqrt((0.01**2 + 0.02**2) / 2)
-    error_mag = _scale_error_mag(scale_of_stars([1.0, 3.0]), rounding_mag)
-    readings_mag = 0.003 * MAG_A_RELATIVE
-    assert error_mag == pytest.approx(math.hypot(readings_mag, SYSTEMATIC_MAG, rounding))
-    none = _scale_error_mag(scale_of_stars([1.0, 1.0], None), np.zeros((2, 2)))
-    assert none == pytest.approx(SYSTEMATIC_MAG)
+    two = MeasuredScale(7e4, 8e4, np.ones(2), np.array([1.0, 3.0]), noise_mag=0.003)
+    error_mag = _scale_error_mag(two, rounding_mag)
+    assert error_mag == pytest.approx(math.hypot(0.003, SYSTEMATIC_MAG, rounding))
+    one = MeasuredScale(7e4, 8e4, np.ones(1), np.ones(1), noise_mag=0.003)
+    assert _scale_error_mag(one, np.zeros((1, 2))) == pytest.approx(SYSTEMATIC_MAG)
 
 
 def test_a_trend_is_what_a_line_over_the_logarithm_changes_between_its_ends(rng):
@@ -163,10 +186,8 @@ def test_a_trend_is_what_a_line_over_the_logarithm_changes_between_its_ends(rng)
     assert error_mag == pytest.approx(line.stderr * span)
     weights = rng.uniform(1, 4, 30)
     slope = np.polyfit(np.log(e_per_s), noise, 1, w=np.sqrt(weights))[0]
-    used = np.ones(30, dtype=bool)
     rounding_mag = np.column_stack([0.1 * np.log(e_per_s), -0.1 * np.log(e_per_s)])
-    seen = SimpleNamespace(e_per_s=e_per_s, rounding_mag=rounding_mag)
-    trend_mag, with_rounding_mag = _scale_trend(seen, used, noise, weights)
+    trend_mag, with_rounding_mag = _scale_trend(e_per_s, noise, weights, rounding_mag)
     assert trend_mag == pytest.approx(slope * span)
     alone_mag = trend(e_per_s, noise, np.sqrt(weights))[1]
     assert with_rounding_mag == pytest.approx(math.hypot(alone_mag, 0.1 * span))
@@ -184,9 +205,7 @@ def test_a_trend_is_what_a_line_over_the_logarithm_changes_between_its_ends(rng)
     ],
 )
 def test_stars_that_miss_a_limit_are_a_reason_each(figures, is_scattered, words):
-    verify = SimpleNamespace(flux_mag=0.05)
-    context = SimpleNamespace(file=SimpleNamespace(config=SimpleNamespace(verify=verify)))
-    reasons = _star_reasons(context, figures, is_scattered=is_scattered)
+    reasons = _star_reasons(figures, 0.05, is_scattered=is_scattered)
     assert len(reasons) == len(words)
     for reason, word in zip(reasons, words, strict=True):
         assert word in reason
@@ -219,18 +238,18 @@ def test_a_scale_that_stars_contradict_says_by_how_much(scatter, over_light, err
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_the_psf_of_the_focus_counts_where_it_contradicts_the_bench_file(monkeypatch, sign):
+def test_the_psf_of_the_focus_counts_where_it_contradicts_the_bench_file(tmp_path, sign):
     """Within two of its errors it is the bench file's, narrower or wider; unmeasured, too."""
-    monkeypatch.setattr(context, "psf_sigma_of", lambda file: 1.0)
 
-    def agreed_px(measured_px: float, **known: float) -> float:
-        step = SimpleNamespace(file=None, psf_sigma_px=measured_px, known=known)
-        return context.StepContext.agreed_psf_sigma_px.fget(step)
+    def agreed_px(measured_px: float, **error: float) -> float:
+        known = {"focus.psf_sigma_px": measured_px} | error
+        step = closed_context(tmp_path, ClosedCamera(), known=known)
+        return step.agreed_psf_sigma_px
 
     error = {"focus.psf_sigma_error_px": 0.1}
-    assert agreed_px(1 + 0.19 * sign, **error) == 1.0
-    assert agreed_px(1 + 0.21 * sign, **error) == 1 + 0.21 * sign
-    assert agreed_px(1 + 0.9 * sign) == 1.0
+    assert agreed_px(SIGMA_PX + 0.19 * sign, **error) == SIGMA_PX
+    assert agreed_px(SIGMA_PX + 0.21 * sign, **error) == SIGMA_PX + 0.21 * sign
+    assert agreed_px(SIGMA_PX + 0.9 * sign) == SIGMA_PX
 
 
 def dots(count: int, rng, size_px=(160, 90)) -> DotLight:
@@ -348,16 +367,10 @@ def test_dots_determine_a_map_s_fields_where_each_has_many(rng):
 
 def test_places_are_off_by_their_distance_in_pixels_and_in_arcsec():
     residual_px = np.array([[0.3, 0.4], [0.0, -1.0], [0.0, 0.0], [1.2, 0.5]])
-    seen = SimpleNamespace(
-        residual_px=residual_px,
-        place_noise_px=np.full(4, 0.2),
-        beyond_px=SimpleNamespace(sigma=0.5, high=0.9),
-        lost=3,
-        frames=2,
-    )
-    tracker = SimpleNamespace(focal_length_px=5000.0)
-    context = SimpleNamespace(geometry=lambda: SimpleNamespace(tracker=tracker))
-    figures = _place_figures(context, seen)
+    place_noise_px = np.full(4, 0.2)
+    seen = stars_seen(residual_px=residual_px, place_noise_px=place_noise_px, lost=3, frames=2)
+    beyond = seen.beyond_px
+    figures = _place_figures(seen, 5000.0)
     rms_px = math.sqrt((0.25 + 1 + 1.69) / 4)
     assert figures["star_rms_px"] == pytest.approx(rms_px)
     assert figures["star_rms_arcsec"] == pytest.approx(rms_px / 5000 * 206264.806)
@@ -365,8 +378,8 @@ def test_places_are_off_by_their_distance_in_pixels_and_in_arcsec():
     # two axes: the root of 2, and the 95 % of a Rayleigh distribution
     assert figures["star_noise_px"] == pytest.approx(0.2 * math.sqrt(2))
     p95 = stats.rayleigh.ppf(0.95)
-    assert figures["star_beyond_noise_p95_px"] == pytest.approx(0.5 * p95, rel=1e-4)
-    assert figures["star_beyond_noise_max_px"] == pytest.approx(0.9 * p95, rel=1e-4)
+    assert figures["star_beyond_noise_p95_px"] == pytest.approx(beyond.sigma * p95, rel=1e-4)
+    assert figures["star_beyond_noise_max_px"] == pytest.approx(beyond.high * p95, rel=1e-4)
 
 
 @pytest.mark.parametrize(("low", "high"), [(-4.0, 10.0), (2.0, 5.0)])
@@ -408,165 +421,127 @@ def test_light_is_even_where_it_varies_by_less_than_a_star_s_error(rms_mag, is_e
 )
 def test_a_lattice_has_dots_apart_and_not_too_many(psf_px, screen_px, period):
     """Half a pixel of the tracker's to one of the monitor's, and dots of three."""
-    cameras = [SimpleNamespace(focal_length_px=f) for f in (1600.0, 800.0)]
-    geometry = SimpleNamespace(monitor=cameras[0], tracker=cameras[1])
-    spacing = _spacing(
-        SimpleNamespace(
-            real_geometry=lambda: geometry, psf_sigma_px=psf_px, resolution_px=screen_px
-        )
-    )
+    geometry = BenchGeometry(camera(screen_px, 1600.0), camera((400, 300), 800.0))
+    spacing = spacing_for(geometry, psf_px)
     sigma_px = math.hypot(psf_px, 1.5 / math.sqrt(12))
     assert spacing.sigma_px == pytest.approx(sigma_px)
     assert spacing.period == period
     assert spacing.reach == pytest.approx(min(period / 4, 9 * sigma_px))
 
 
-@pytest.mark.parametrize(("left_mag", "known_mag"), [(0.001, None), (0.0, None), (0.001, 0.03)])
-def test_where_light_is_called_even_what_its_map_has_is_an_error(
-    monkeypatch, tmp_path, left_mag, known_mag
-):
-    """A map of 0.0015 mag, less than is worth a map, which is written nowhere: its standard
-    deviation adds to its own error.
+def test_where_light_is_called_even_what_its_map_has_is_an_error():
+    """Maps of 0.0015 mag, less than is worth a map: their standard deviation adds to the error of
+    the map that the bench file then has.
     """
-    at_dots = 10 ** (-0.4 * 0.0015 * np.tile([1.0, -1.0], 20))
-
-    def map_of(dots, light, size_px):
-        shape = 10 ** (-0.4 * float(np.std(light)) * np.tile([1.0, -1.0], 20))
-        used = np.ones(40, dtype=bool)
-        if np.ptp(light):
-            # what the bench file's map leaves of even light
-            return UniformityMap(np.ones((2, 2)), shape, 0.005, 0.0, used, 0.007, 0.0)
-        return UniformityMap(np.ones((2, 2)), at_dots, 0.0005, 0.0, used, left_mag, 0.0)
-
-    known = None
-    if known_mag is not None:
-        known = np.ones((40, 1), dtype=np.float32)
-        known[::2] = 0.5
-    places = np.arange(40)
-    seen = DotLight(np.zeros(40, dtype=int), places, np.ones(40), 0.002)
-    monkeypatch.setattr(uniformities, "see_dots", lambda context: (seen, ()))
-    monkeypatch.setattr(uniformities, "map_of", map_of)
-    monkeypatch.setattr(
-        uniformities,
-        "calibration_of",
-        lambda context: SimpleNamespace(uniformity_map=lambda size_px: known),
-    )
-    monkeypatch.setattr(uniformities, "draw_uniformity", lambda *given: None)
-    written = []
-
-    def write_map(context, light_map, error_mag):
-        written.append(error_mag)
-        return [], ()
-
-    monkeypatch.setattr(uniformities, "_write_map", write_map)
-    at = SimpleNamespace(resolution_px=(1, 40), truth=None, session=tmp_path)
-    outcome = measured_uniformity(at)
-    wanted_mag = math.hypot(left_mag, 0.0015)
-    assert outcome.figures["map_error_mag"] == pytest.approx(wanted_mag)
-    assert outcome.figures["change_rms_mag"] == pytest.approx(0.0015)
-    assert written == ([] if known_mag is None else [pytest.approx(wanted_mag)])
+    even = 10 ** (-0.4 * 0.0015 * np.tile([1.0, -1.0], 20))
+    used = np.ones(40, dtype=bool)
+    uneven = UniformityMap(np.ones((2, 2)), even**20, 0.005, 0.0, used, 0.007, 0.0)
+    called_even = UniformityMap(np.ones((2, 2)), even, 0.0005, 0.0, used, 0.001, 0.0)
+    noise_mag = 0.002
+    with_map_mag = math.hypot(0.001, 0.0015)
+    for light_map, against, wanted_mag in (
+        # the bench file has it so
+        (uneven, called_even, with_map_mag),
+        # it has a map, which goes
+        (called_even, uneven, with_map_mag),
+        (uneven, uneven, uneven.error_mag(noise_mag)),
+    ):
+        found_mag = known_error_mag(light_map, against, noise_mag)
+        assert found_mag == pytest.approx(wanted_mag)
 
 
-def test_each_primary_s_share_is_of_all_channels(monkeypatch):
-    rates = np.array([[1.0, 2.0, 3.0], [10.0, 20.0, 30.0]])
-    monkeypatch.setattr(photometry, "bench_primaries", lambda monitor, folder: "primaries")
-    monkeypatch.setattr(photometry, "named_channels", lambda tracker, folder: "channels")
-    monkeypatch.setattr(photometry, "channel_matrix", lambda *given: SimpleNamespace(e_per_s=rates))
-    file = SimpleNamespace(config=SimpleNamespace(monitor=None, tracker=None), folder=None)
-    assert photometry.shares_of_white(file).tolist() == [11.0, 22.0, 33.0]
+def test_each_primary_s_share_is_of_all_channels(tmp_path):
+    """Channels of an efficiency of their own, even over the spectrum, have of each primary what it
+    has of photons, of all three.
+    """
+    nm = np.arange(400.0, 701.0, 10.0)
+    spectra = [bump(middle, 30, nm) for middle in (620, 540, 460)]
+    write_panel(tmp_path / "panel.csv", spectra, nm)
+    efficiencies = {"r": 0.2, "g": 0.5, "b": 0.3}
+    curves = {name: np.full_like(nm, share) for name, share in efficiencies.items()}
+    keys = write_channels(tmp_path, nm, curves) | {"transmission": 1.0}
+    primaries = {"file": "panel.csv", "layout": "rgb-stripe"}
+    bench = {"tracker": keys, "monitor.primaries": primaries}
+    shares = shares_of_white(closed_context(tmp_path, ClosedCamera(), bench).file)
+    photons = np.array(spectra) @ nm
+    # the spectra end at 400 and 700 nm, where a bump of 460 nm is not over
+    assert shares / shares.sum() == pytest.approx(photons / photons.sum(), rel=3e-3)
 
 
-def test_a_hot_pixel_does_not_fill_a_range():
-    """Of 400 DN; the second column has a hot pixel."""
-    at = SimpleNamespace(
-        _cold=np.array([[True, False], [True, True]]), context=SimpleNamespace(full_dn=400)
-    )
-    assert Photometer._filled(at, np.array([[10.0, 390.0], [100.0, 50.0]])) == 0.25
+def made_photometer(folder, camera: ClosedCamera | None = None, **changes) -> Photometer:
+    """A photometer of white light on the closed bench."""
+    context = closed_context(folder, camera or ClosedCamera(), **changes)
+    return Photometer(context, SIGMA_PX, Assumed({"w": power_of(2.2)}, 0.0))
+
+
+def test_a_hot_pixel_does_not_fill_a_range(tmp_path):
+    photometer = made_photometer(tmp_path)
+    photometer._cold[3, 5] = False
+    part = np.full(photometer._cold.shape, 0.1 * FULL_DN)
+    part[3, 5], part[5, 3] = 0.9 * FULL_DN, 0.25 * FULL_DN
+    assert photometer._filled(part) == pytest.approx(0.25)
 
 
 @pytest.mark.parametrize(("times", "name"), [(1, "patch"), (4, "patch_4"), (16, "patch_16")])
-def test_an_image_is_named_by_its_longer_exposure(times, name):
-    taken = []
-
-    def take(pattern, exposure_s):
-        taken.append((pattern.name, exposure_s))
-        return Path(pattern.name)
-
-    photometer = SimpleNamespace(
-        field=SimpleNamespace(lattice=lambda size_px, period, patch: None),
-        context=SimpleNamespace(resolution_px=(8, 8), take=take),
-        exposure_s=0.25,
-        images=[],
-    )
-    path = Photometer._take(photometer, "patch", Range(4, times), Patch(100, "w"))
-    assert taken == [(name, 0.25 * times)]
-    assert photometer.images == [path]
+def test_an_image_is_named_by_its_longer_exposure(tmp_path, times, name):
+    camera = ClosedCamera()
+    photometer = made_photometer(tmp_path, camera)
+    path = photometer._take("patch", Range(4, times), Patch(100, "w"))
+    assert camera.taken[-1] == (name, EXPOSURE_S * times)
+    assert photometer.images[-1] == path
 
 
-def test_light_that_rounding_hides_has_shot_noise():
-    """Light of -3 DN is none, of 50 DN is that; rounding hides 2 DN rms of each."""
-    asked = []
-
-    def sum_dn2(light_dn, times, blacks):
-        asked.append((light_dn, times, blacks))
-        return 9.0
-
-    patches = [Patch(5, "w"), Patch(9, "w"), Patch(0, "w"), Patch(0, "w")]
+def test_light_that_rounding_hides_has_shot_noise(tmp_path):
+    """Light of -3 DN is none, of 50 DN is that, and each has what rounding hides of it. Black images
+    have a variance of 16 DN^2, light 0.25 DN an electron.
+    """
+    photometer = made_photometer(tmp_path)
+    photometer.scatter = PixelScatter(default_dn_per_e=0.25)
+    for off_dn in (0.0, math.sqrt(32.0)):
+        photometer.scatter.add(BLACK, Range(1, 4), np.array([[off_dn]]))
+    patches = [Patch(5, "w"), Patch(9, "w"), BLACK, BLACK]
     at = Range(2, 4)
-    photometer = SimpleNamespace(
-        field=SimpleNamespace(monitor_px=100.0),
-        exposure_s=0.5,
-        scatter=SimpleNamespace(dark_dn2=lambda times: 16.0, sum_dn2=sum_dn2),
-        _dots=lambda at: 10,
-        _rounded=lambda at, light_dn: np.array([2.0, -2.0]),
-    )
+    lights_dn = (-3.0, 50.0)
     lit = {}
-    for order, light_dn in enumerate((-3.0, 50.0)):
-        lit[order] = SimpleNamespace(patch=patches[order], at=at, light_dn=light_dn, blacks=0.5)
-    factors = {("w", at): 2.0}
-    values = Photometer._values(photometer, patches, lit, np.array([5.0, 15.0]), factors)
-    assert asked == [(2.0, 4, 0.5), (52.0, 4, 0.5)]
-    np.testing.assert_allclose(values.light, [-0.3, 5.0, -0.1, 0.1])
-    # black is of 100 px of the monitor
-    np.testing.assert_allclose(values.sigma, [0.3, 0.3, 0.08, 0.08])
-
-
-def test_what_the_lowest_code_adds_is_less_by_what_it_adds_to_a_ratio():
-    """A ratio of 1000 to 100 DN, of which 40 and 10 were added: 4 % less 10 %."""
-    added_dn = {1000.0: 40.0, 100.0: 10.0, 200.0: 8.0}
-    photometer = SimpleNamespace(_cut_dn=lambda at, light_dn: added_dn[light_dn])
-    patch = Patch(100, "w")
-    at = Range(1, 1)
-    pair = SimpleNamespace(more=at, less=at, light_dn=(1000.0, 100.0))
-    link = SimpleNamespace(patch=patch, dense=1, times=(1, 1))
-    values = SimpleNamespace(light=np.array([0.0, 5.0]), per_dn=np.array([0.0, 0.5]))
-    lit = {1: SimpleNamespace(patch=patch, at=at, light_dn=200.0)}
-    effect = Photometer._of_cut(photometer, values, lit, [pair], [link])
-    np.testing.assert_allclose(effect, [0.0, 8 * 0.5 + 5 * 0.06])
-
-
-def test_a_file_is_named_from_the_bench_file_s_folder():
-    at = SimpleNamespace(
-        file=SimpleNamespace(folder=Path("/benches/first")),
-        session=Path("/benches/first/session"),
-        change=lambda *named: named,
+    for order, light_dn in enumerate(lights_dn):
+        lit[order] = _Reading(patches[order], at, light_dn, blacks=0.5)
+    values = photometer._values(patches, lit, np.array([5.0, 15.0]), {("w", at): 2.0})
+    dots_s = photometer.field.lit(2) * 4 * 2.0 * EXPOSURE_S
+    screen_s = photometer.field.monitor_px * EXPOSURE_S
+    np.testing.assert_allclose(
+        values.light, [-3 / dots_s, 50 / dots_s, -5 / screen_s, 5 / screen_s]
     )
-    named = StepContext.names(at, "collimator", "geometry", at.session / "geometry.toml")
-    assert named == ("collimator", "geometry", "session/geometry.toml")
-    at.file.folder = Path("/benches/second")
-    named = StepContext.names(at, "collimator", "geometry", at.session / "geometry.toml")
-    assert named[2] == "../first/session/geometry.toml"
+    for order, light_dn in enumerate(lights_dn):
+        hidden_dn = math.sqrt(float((photometer._rounded(at, light_dn) ** 2).mean()))
+        assert hidden_dn > 0
+        variance = 0.25 * (max(light_dn, 0.0) + hidden_dn) + 1.5 * 16
+        assert values.sigma[order] == pytest.approx(math.sqrt(variance) / dots_s)
+    np.testing.assert_allclose(values.sigma[2:], 4 / screen_s)
 
 
-@pytest.mark.parametrize("step", STEPS, ids=[step.name for step in STEPS])
-def test_a_step_that_was_skipped_runs_again_where_what_it_lacked_may_be_there(step):
-    number = STEPS.index(step)
-    session = SimpleNamespace(
-        records={}, unfinished={}, _unmet=lambda step: None, _state=lambda number: "state"
-    )
-    for verdict, is_done in (("done", True), ("skipped", not step.needs), ("failed", False)):
-        record = SimpleNamespace(verdict=verdict, state_sha256="state", files={})
-        session.records = {step.name: record}
-        assert FirstLightSession._is_done(session, number) == is_done
-        record.state_sha256 = "other"
-        assert not FirstLightSession._is_done(session, number)
+def test_what_the_lowest_code_adds_is_less_by_what_it_adds_to_a_ratio(tmp_path):
+    """Dark images of 0 DN, whose noise an ADC cuts at its lowest code."""
+    photometer = made_photometer(tmp_path)
+    photometer.scatter = PixelScatter(default_dn_per_e=0.25)
+    photometer.scatter.add(BLACK, Range(1), np.zeros((2, 2)))
+    patch, at, less = Patch(100, "w"), Range(1), Range(4)
+    added_dn = [photometer._cut_dn(*lit) for lit in ((at, 200.0), (at, 1000.0), (less, 100.0))]
+    # light takes noise off the lowest code
+    assert max(added_dn) < 0
+    pair = _Pair(patch, at, less, (1000.0, 100.0), (1.0,))
+    link = LatticeRatio(patch, 1, 4, 1.0)
+    values = _Values(np.array([0.0, 5.0]), np.ones(2), np.array([0.0, 0.5]))
+    lit = {1: _Reading(patch, at, 200.0, 1.0)}
+    effect = photometer._of_cut(values, lit, [pair], [link])
+    of_ratio = added_dn[1] / 1000 - added_dn[2] / 100
+    np.testing.assert_allclose(effect, [0.0, added_dn[0] * 0.5 - 5 * of_ratio])
+
+
+@pytest.mark.parametrize(
+    ("folder", "name"), [("", "s/geometry.toml"), ("other", "../s/geometry.toml")]
+)
+def test_a_file_is_named_from_the_bench_file_s_folder(tmp_path, folder, name):
+    (tmp_path / folder).mkdir(exist_ok=True)
+    context = replace(closed_context(tmp_path / folder, ClosedCamera()), session=tmp_path / "s")
+    (change,) = context.names("collimator", "geometry", tmp_path / "s" / "geometry.toml")
+    assert (change.table, change.key, change.after) == ("collimator", "geometry", name)

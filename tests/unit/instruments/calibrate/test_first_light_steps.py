@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ from scipy import stats
 from hilstar.display.calibration import load_calibration, read_toml, with_uniformity
 from hilstar.display.response import srgb_response
 from hilstar.instruments.calibrate.first_light import stars
-from hilstar.instruments.calibrate.first_light import uniformity as uniformities
 from hilstar.instruments.calibrate.first_light.context import StepOutcome, rewrite, with_changes
 from hilstar.instruments.calibrate.first_light.focus import first_dots, focus
 from hilstar.instruments.calibrate.first_light.geometry import geometry, orientation
@@ -26,7 +24,9 @@ from hilstar.instruments.calibrate.first_light.session import display, latency
 from hilstar.instruments.calibrate.first_light.stars import scale, verify
 from hilstar.instruments.calibrate.first_light.uniformity import (
     _White,
+    dot_noise_mag,
     see_dots,
+    spacing_for,
     uniformity,
     warm_up,
 )
@@ -37,8 +37,11 @@ from hilstar.instruments.calibrate.measurements import read_measurements
 from hilstar.instruments.calibrate.plan import Patch
 from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.cameras import bench_camera
+from hilstar.server.screen.gate import Timing
 from hilstar.server.screen.screen import marker_light
+from hilstar.tracker.centroids import noisiest_background
 from hilstar.tracker.rounding import rounding_rms
+from hilstar.tracker.settings import DetectorSettings
 from tests.support.closed_camera import (
     AXIS_PX,
     BITS,
@@ -320,9 +323,7 @@ def test_a_warm_up_is_watched_until_white_is_stable(tmp_path, share):
     np.testing.assert_allclose(rows[:, 0], 10.0 * np.arange(figures["readings"]))
     # the dots' light without the glow of what is not lit
     np.testing.assert_allclose(
-        rows[:, 1] / rows[-1, 1],
-        (1 + share * np.exp(-rows[:, 0] / 200)) / (1 + rest),
-        rtol=0.006,
+        rows[:, 1] / rows[-1, 1], (1 + share * np.exp(-rows[:, 0] / 200)) / (1 + rest), rtol=0.006
     )
 
 
@@ -627,13 +628,7 @@ def test_light_that_is_early_by_its_noise_alone_is_no_delay(tmp_path, delay_ms):
 @pytest.mark.parametrize("is_paced", [True, False])
 def test_a_display_is_timed_by_its_own_frames(tmp_path, is_paced):
     camera = ClosedCamera()
-    timing = SimpleNamespace(
-        period_ms=12.5,
-        period_error_ms=0.003,
-        dropped=2,
-        paced_by_screen=is_paced,
-        modes_hz=[60, 80],
-    )
+    timing = Timing(12.5, 2, is_paced, modes_hz=(60, 80), period_error_ms=0.003)
     camera.gate = lambda file: timing
     camera.forced = ["another rate"]
     outcome = display(closed_context(tmp_path, camera))
@@ -716,37 +711,31 @@ def test_dots_that_differ_from_one_to_the_next_far_beyond_their_noise_are_no_map
     assert "that is far above their noise: dust, a panel uneven from pixel to pixel" in outcome.line
 
 
-def test_a_response_from_pixel_to_pixel_is_averaged_over_a_dot(tmp_path):
-    """A detector of 6 % PRNU: a Gaussian spreads a dot over 4 pi of its sigma squared."""
-    noise_mag = {}
-    for prnu in (0.0, 0.06):
-        camera = ClosedCamera(srgb_response(BITS).light)
-        detector = {"tracker.detector": {"prnu": prnu}}
-        context = closed_context(tmp_path, camera, detector, known=dict(FOCUSED))
-        dots, _ = see_dots(context)
-        noise_mag[prnu] = dots.noise_mag
-    sigma2_px2 = SIGMA_PX**2 + (3 * RATIO) ** 2 / 12
-    response = 0.06 / math.sqrt(4 * math.pi * sigma2_px2)
-    added = math.sqrt(noise_mag[0.06] ** 2 - noise_mag[0.0] ** 2) / MAG_A_RELATIVE
-    assert added == pytest.approx(response, rel=1e-6)
+@pytest.mark.parametrize(
+    ("prnu", "noise_dn", "relative"),
+    [
+        # photons of 40 000 e-
+        (0.0, 0.0, 1 / 200),
+        # a Gaussian of 0.8 px spreads a dot over 4 pi of its sigma squared
+        (0.06, 0.0, math.hypot(1 / 200, 0.06 / math.sqrt(4 * math.pi * 0.64))),
+        # and all pixels within 3 px of it
+        (0.0, 100.0, math.hypot(1 / 200, 100 * math.sqrt(math.pi) * 3 / 10_000)),
+    ],
+)
+def test_a_dot_is_as_noisy_as_its_photons_its_pixels_response_and_all_in_its_reach(
+    prnu, noise_dn, relative
+):
+    detector = DetectorSettings(gain_e_per_dn=4.0, prnu=prnu)
+    noise_mag = dot_noise_mag(10_000.0, noise_dn, 3.0, 0.8, detector)
+    assert noise_mag == pytest.approx(MAG_A_RELATIVE * relative)
 
 
-def test_a_dot_is_as_noisy_as_its_photons_and_all_pixels_in_its_reach(tmp_path, monkeypatch):
-    """Half of the noise is that of the background: of 100 DN in a pixel."""
-    noise_mag = {}
-    background = SimpleNamespace(noise=0.0)
-    monkeypatch.setattr(uniformities, "noisiest_background", lambda image: background)
-    camera = ClosedCamera(srgb_response(BITS).light)
-    context = closed_context(tmp_path, camera, known=dict(FOCUSED))
-    for noise_dn in (0.0, 100.0):
-        background.noise = noise_dn
-        dots, _ = see_dots(context)
-        noise_mag[noise_dn] = dots.noise_mag
-    dn = float(np.median(dots.light))
-    photons_mag = MAG_A_RELATIVE / math.sqrt(dn * GAIN_E_PER_DN)
-    # of other images, with photons of their own
-    assert noise_mag[0.0] == pytest.approx(photons_mag, rel=1e-3)
-    reach_px = uniformities._spacing(context).reach * RATIO
-    added_mag = math.sqrt(noise_mag[100.0] ** 2 - photons_mag**2)
-    wanted_mag = MAG_A_RELATIVE * 100 * math.sqrt(math.pi) * reach_px / dn
-    assert added_mag == pytest.approx(wanted_mag, rel=1e-3)
+def test_dots_are_summed_over_the_tracker_s_pixels_in_their_reach(tmp_path):
+    context = closed_context(tmp_path, ClosedCamera(), known=dict(FOCUSED))
+    dots, images = see_dots(context)
+    spacing = spacing_for(context.real_geometry(), SIGMA_PX)
+    last = context.looked(images[-1], context.read(context.dark()))
+    noise_dn = noisiest_background(last.image).noise
+    dn, reach_px = float(np.median(dots.light)), spacing.reach * RATIO
+    wanted_mag = dot_noise_mag(dn, noise_dn, reach_px, spacing.sigma_px, context.detector)
+    assert dots.noise_mag == pytest.approx(wanted_mag, rel=0.01)

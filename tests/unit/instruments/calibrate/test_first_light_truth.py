@@ -5,16 +5,15 @@ twin of both benches.
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from hilstar.instruments.calibrate.first_light import stars
-from hilstar.instruments.calibrate.first_light.stars import _against_truth, _twin_file
+from hilstar.instruments.calibrate.first_light.stars import _against_truth, _known_glow, _twin_file
 from hilstar.instruments.calibrate.first_light.uniformity import _warm_up_truth
 from hilstar.instruments.verify.measure import GlowFit
 from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.config.certify import VirtualSettings
 from tests.support.benches import bench_text
 from tests.support.closed_camera import CLOSED, SCREEN_PX
 
@@ -34,9 +33,8 @@ def test_a_planted_warm_up_drifts_by_its_slope_at_the_end_of_the_watch(change_pe
     """White comes near by an exponential of 5 minutes, and drifts on by 0.3 %/h. The monitor was on
     for 200 s when the watch began, and the watch is over after 900 s of its own.
     """
-    virtual = SimpleNamespace(warm_up_min=5.0, cold_percent=change_percent, drift_percent_per_h=0.3)
-    truth = SimpleNamespace(config=SimpleNamespace(certify=SimpleNamespace(virtual=virtual)))
-    figures = _warm_up_truth(truth, SimpleNamespace(limit=0.002), 1100.0, 900.0)
+    virtual = VirtualSettings(warm_up_min=5.0, cold_percent=change_percent, drift_percent_per_h=0.3)
+    figures = _warm_up_truth(virtual, 0.002, 1100.0, 900.0)
 
     def white(t_s: float) -> float:
         return 1 - change_percent / 100 * math.exp(-t_s / 300) + 0.003 * t_s / 3600
@@ -48,7 +46,7 @@ def test_a_planted_warm_up_drifts_by_its_slope_at_the_end_of_the_watch(change_pe
         abs(change_percent) / 100 * (math.exp(-stable_s / 300) - math.exp(-(stable_s + 600) / 300))
     )
     assert ahead == pytest.approx(0.002, rel=1e-6)
-    late = _warm_up_truth(truth, SimpleNamespace(limit=0.9), 1100.0, 900.0)
+    late = _warm_up_truth(virtual, 0.9, 1100.0, 900.0)
     assert late["truth_stable_after_s"] == 0.0
 
 
@@ -58,8 +56,7 @@ def test_a_truth_s_directions_are_off_by_the_angle_between_them(tmp_path):
     """
     file = bench(tmp_path, "filed")
     truth = bench(tmp_path, "true", {"collimator": {"q_cam_to_mon": [1.0, 2e-4, 0.0, 2e-3]}})
-    context = SimpleNamespace(file=file, truth=truth, resolution_px=SCREEN_PX)
-    figures = _against_truth(context)
+    figures = _against_truth(file, truth)
     focal_px = 40e3 / 57.65
     x, y = np.meshgrid(np.linspace(0, SCREEN_PX[0] - 1, 21), np.linspace(0, SCREEN_PX[1] - 1, 21))
     right, down = (x - 50.0) / focal_px, (y - 55.0) / focal_px
@@ -81,14 +78,14 @@ def test_the_twin_of_a_virtual_session_has_the_truth_s_light_and_the_file_s_limi
         "verify": {"flux_mag": 0.5},
     }
     truth = bench(tmp_path, "true", true)
-    verify = _twin_file(SimpleNamespace(file=file, truth=truth)).config.verify
+    verify = _twin_file(file, truth).config.verify
     assert verify.true_flux_at_white_e_per_s == pytest.approx(70_000.0)
     assert verify.true_calibration == "gamma2.2"
     assert (verify.true_focal_length_mm, verify.true_pixel_pitch_um) == (41.0, 58.0)
     assert verify.true_q_cam_to_mon == pytest.approx((1.0, 0.0, 1e-3, 0.0), abs=1e-6)
     assert verify.true_geometry is None
     assert (verify.flux_mag, verify.lost_share) == (0.07, 0.3)
-    assert _twin_file(SimpleNamespace(file=file, truth=None)) is file
+    assert _twin_file(file, None) is file
 
 
 @pytest.mark.parametrize(
@@ -108,22 +105,8 @@ def test_the_twin_of_a_virtual_session_has_the_truth_s_light_and_the_file_s_limi
         ),
     ],
 )
-def test_a_glow_is_judged_no_closer_than_the_session_knows_it(monkeypatch, figures, share):
+def test_a_glow_is_judged_no_closer_than_the_session_knows_it(figures, share):
     """To three sigmas of 100 e-/s, where the bench's own limit is 4."""
-    seen = []
-    glow = GlowFit(100.0, 117.0, 4.0)
-    run = SimpleNamespace(measured=stars_measured(glow))
-    monkeypatch.setattr(stars, "run_twin", lambda file, fields, rng: run)
-    monkeypatch.setattr(stars, "judge", seen.append)
-    stars._twin(SimpleNamespace(known=figures, truth=None, file=None))
-    (measured,) = seen
-    limit = measured.glow.limit_e_per_s_px
-    assert limit == pytest.approx(max(4.0, 3 * share * 100.0))
-    assert (measured.glow.assumed_e_per_s_px, measured.glow.seen_e_per_s_px) == (100.0, 117.0)
-
-
-def stars_measured(glow: GlowFit):
-    """What a twin measured, of which the glow alone counts."""
-    from tests.unit.instruments.verify.test_summary import measured
-
-    return measured(glow=glow)
+    known = _known_glow(GlowFit(100.0, 117.0, 4.0), figures)
+    limit = max(4.0, 3 * share * 100.0)
+    assert known == GlowFit(100.0, 117.0, pytest.approx(limit))

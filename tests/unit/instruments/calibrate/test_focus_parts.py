@@ -5,13 +5,13 @@ their derivatives, light and background, weights, and which dots stand alone.
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.special import ndtr
 
 from hilstar.basics.errors import InputError
+from hilstar.display.geometry import monitor_camera
 from hilstar.instruments.calibrate.first_light import focus
 from hilstar.instruments.calibrate.first_light.focus import (
     ROUNDS,
@@ -33,6 +33,8 @@ from hilstar.instruments.calibrate.first_light.focus import (
     sharpness,
     why_blurred,
 )
+from hilstar.instruments.calibrate.geometric.dots import SeenScreen
+from hilstar.tracker.settings import DetectorSettings
 from tests.support.refusals import refusal
 
 HALF = 6
@@ -226,13 +228,19 @@ def test_squares_about_dots_hold_a_turned_one_s_corners(monkeypatch, rng, turn_d
     assert halves == [math.ceil(side / 2 + 4)]
 
 
-def test_the_mean_of_images_has_as_many_times_the_electrons_in_a_dn(monkeypatch):
-    asked = []
-    monkeypatch.setattr(focus, "sharpness", lambda *given: asked.append(given))
-    screen = SimpleNamespace(tracker_px_a_monitor_px=0.8, turn_deg=12.0)
-    detector = SimpleNamespace(gain_e_per_dn=4.0, prnu=0.01)
-    seen_sharpness("image", screen, detector, images=3)
-    assert asked == [("image", pytest.approx(3 * 0.8), 12.0, DotNoise(12.0, 0.01))]
+def test_the_mean_of_images_has_as_many_times_the_electrons_in_a_dn(rng):
+    """Of squares of three monitor pixels, a tracker pixel each."""
+    upright = np.array([1.0, 0.0, 0.0, 0.0])
+    monitor = monitor_camera((640, 480), 50.0, 100.0, upright)
+    tracker = monitor_camera((120, 120), 50.0, 100.0 * SIDE_PX / 3, upright)
+    screen = SeenScreen(monitor, tracker, is_sure=True, psf_sigma_px=0.8)
+    detector = DetectorSettings(gain_e_per_dn=4.0, prnu=0.01)
+    image = drawn_dots(np.full(25, 0.8), 2.0, rng)
+    found = seen_sharpness(image, screen, detector, images=3)
+    wanted = sharpness(image, SIDE_PX, 0.0, DotNoise(12.0, 0.01))
+    one = sharpness(image, SIDE_PX, 0.0, DotNoise(4.0, 0.01))
+    assert found.psf_sigma_error_px == pytest.approx(wanted.psf_sigma_error_px)
+    assert found.psf_sigma_error_px != pytest.approx(one.psf_sigma_error_px)
 
 
 # Of pixels that are seen 1.5 px wide; the bench file states 0.8 px of PSF.

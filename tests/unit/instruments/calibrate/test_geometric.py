@@ -359,4 +359,4 @@ def test_eleven_dots_are_too_few_for_each_step_of_a_fit(step, tmp_path, rng):
                 patch.setattr(geometry_fit, "nominal_of", lambda file: nominal_of(BENCH))
                 geometry_fit.rough_geometry(file, plan, few)
         else:
-            geometry_fit.without_s_curves(plan, nominal_of(BENCH), few, 1.0)
+            geometry_fit.without_s_curves(plan, nominal_of(BENCH), few, 0.5)

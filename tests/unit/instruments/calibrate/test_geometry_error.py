@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,15 +17,20 @@ from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.display.geometry import load_notes
 from hilstar.instruments.calibrate.first_light.geometry import _ends_of, _geometry_figures
 from hilstar.instruments.calibrate.geometric import fit as geometric_fit
-from hilstar.instruments.calibrate.geometric import geometry_fit
 from hilstar.instruments.calibrate.geometric.dot_shape import DotShape
-from hilstar.instruments.calibrate.geometric.dots import SeenScreen, lit_for, plan_seen_dots
+from hilstar.instruments.calibrate.geometric.dots import (
+    DotPlan,
+    SeenScreen,
+    lit_for,
+    plan_seen_dots,
+)
 from hilstar.instruments.calibrate.geometric.fit import (
     BROWN_CONRADY,
     GAIN,
     PINHOLE,
     RADIAL,
     Candidate,
+    Geometry,
     MatchedDots,
     Model,
     Problem,
@@ -39,25 +43,22 @@ from hilstar.instruments.calibrate.geometric.fit import (
 from hilstar.instruments.calibrate.geometric.geometry_fit import (
     ROUND,
     Calibrated,
-    MisfitError,
-    _in_view,
-    _refuse_gaps,
     bounded_to_field,
-    calibrate_seen,
     draw_geometry,
+    in_view,
+    is_tracker_known,
     lines_of,
+    misfit_words,
     nominal_of,
     refuse_few,
+    refuse_gaps,
     refuse_misfit,
     seen_in_pose,
     summary_of,
+    without_s_curves,
     write_calibrated,
 )
-from hilstar.instruments.calibrate.geometric.observed import (
-    Observed,
-    dot_centroids,
-    measure_images,
-)
+from hilstar.instruments.calibrate.geometric.observed import Observed, dot_centroids, measure_images
 from hilstar.optics.camera import Camera, Lens
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import bench_text
@@ -606,22 +607,20 @@ def test_a_dot_is_turned_as_its_pose_is():
 def test_places_are_in_view_farther_than_a_window_from_each_edge(edge_px):
     """Of two cameras alike: a monitor's pixel is the tracker's."""
     camera = Camera((120, 80), 900.0, (50.0, 45.0), np.eye(3))
-    q_poses = np.array([[1.0, 0.0, 0.0, 0.0]])
-    fit_of = SimpleNamespace(
-        geometry=SimpleNamespace(monitor=camera, tracker=camera, q_poses=q_poses)
-    )
+    upright = np.array([1.0, 0.0, 0.0, 0.0])
+    geometry = Geometry(camera, upright, camera, upright[None])
     for axis, last in ((0, 119), (1, 79)):
         for end, inwards in ((edge_px, 1), (last - edge_px, -1)):
             for off, is_seen in ((0.01, True), (-0.01, False)):
                 place = [60.0, 40.0]
                 place[axis] = end + inwards * off
                 x_px, y_px = np.array(place)[:, None]
-                assert _in_view(fit_of, x_px, y_px, edge_px)[0].tolist() == [is_seen]
+                assert in_view(geometry, x_px, y_px, edge_px)[0].tolist() == [is_seen]
     # a quarter turn takes what is at the right down, where the image ends sooner than above
     quarter = np.array([[math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]])
-    turned = SimpleNamespace(monitor=camera, tracker=camera, q_poses=quarter)
+    turned = dataclasses.replace(geometry, q_poses=quarter)
     x_px, y_px = np.array([[50.0 + 38, 50.0 - 38], [45.0, 45.0]])
-    (is_seen,) = _in_view(SimpleNamespace(geometry=turned), x_px, y_px, 0.0)
+    (is_seen,) = in_view(turned, x_px, y_px, 0.0)
     assert is_seen.tolist() == [False, True]
 
 
@@ -630,17 +629,11 @@ def test_a_part_of_an_upright_screen_without_its_dots_is_named():
     corners = [(x, y) for y in (20, 40, 80, 100, 140, 160) for x in (10, 20, 40, 50, 70, 80)]
     x_px, y_px = np.array(corners, dtype=float).T
     ninth = (x_px // 30 + 3 * (y_px // 60)).astype(int)
-    monitor = SimpleNamespace(resolution_px=(90, 180))
+    plan = DotPlan(x_px, y_px, np.ones((36, 1), dtype=bool))
     dots = np.arange(36)
 
     def refuse(is_seen):
-        found = SimpleNamespace(
-            plan=Places(x_px, y_px),
-            problem=SimpleNamespace(nominal=SimpleNamespace(monitor=monitor)),
-            measurable=[np.ones(36, dtype=bool)],
-            data=SimpleNamespace(dot=np.repeat(dots[is_seen], 3)),
-        )
-        return _refuse_gaps(found)
+        refuse_gaps(plan, (90, 180), np.ones(36, dtype=bool), is_seen)
 
     refuse(dots >= 0)
     for place, words in ((8, "lower right"), (2, "upper right"), (4, "middle"), (3, "middle left")):
@@ -650,53 +643,32 @@ def test_a_part_of_an_upright_screen_without_its_dots_is_named():
         assert refused.startswith(f"only 1 of 4 dots were recognised in the {words} of the screen")
 
 
-class Places:
-    """Dots on a screen, of which only the places count."""
-
-    def __init__(self, x_px, y_px):
-        self.x_px, self.y_px = x_px, y_px
-
-    def __len__(self):
-        return len(self.x_px)
-
-
-@pytest.mark.parametrize("sigma_px", [0.4, 0.8, 0.9])
 @pytest.mark.parametrize(
     ("has_model", "is_ideal", "is_known"),
     [(False, False, False), (True, False, True), (False, True, True)],
 )
-def test_a_tracker_s_lens_is_held_where_it_is_stated_and_narrow_dots_are_freed_of_their_s_curve(
-    tmp_path, monkeypatch, sigma_px, has_model, is_ideal, is_known
-):
+def test_a_tracker_s_lens_is_held_where_it_is_stated(tmp_path, has_model, is_ideal, is_known):
     tracker = dict(SMALL_FIELD["tracker"])
     if has_model:
         tracker["distortion"] = "lens.toml"
     path = tmp_path / "bench.toml"
     path.write_text(bench_text(SMALL_FIELD, {"tracker": tracker}))
-    asked = []
+    assert is_tracker_known(read_bench_file(path), is_ideal=is_ideal) == is_known
 
-    def fitted(plan, nominal, seen, rng, *, tracker_known):
-        asked.append((seen, tracker_known))
-        raise MisfitError("they are off")
 
-    def freed(plan, nominal, seen, psf_sigma_px):
-        return seen, psf_sigma_px
+@pytest.mark.parametrize(("sigma_px", "is_freed"), [(0.4, True), (0.8, True), (0.81, False)])
+def test_narrow_dots_are_freed_of_their_s_curve(tmp_path, sigma_px, is_freed):
+    problem, data = dots_of(*tilted_screen(tmp_path, tilt_deg=2.0), 3, 0.01)
+    seen = dataclasses.replace(data.centroids, settings=dot_centroids(1.0))
+    freed = without_s_curves(problem.plan, problem.nominal, seen, sigma_px)
+    assert (freed is not seen) == is_freed
 
-    monkeypatch.setattr(geometry_fit, "calibrate_geometry", fitted)
-    monkeypatch.setattr(geometry_fit, "without_s_curves", freed)
-    monkeypatch.setattr(geometry_fit, "nominal_of", lambda file: None)
-    monkeypatch.setattr(geometry_fit, "dot_sigma_px", lambda file: 1.0)
-    words = refusal(
-        calibrate_seen,
-        read_bench_file(path),
-        "plan",
-        "seen",
-        tracker_is_ideal=is_ideal,
-        psf_sigma_px=sigma_px,
-    )
-    assert words == "they are off"
-    seen = ("seen", sigma_px) if sigma_px <= 0.8 else "seen"
-    assert asked == [(seen, is_known)]
+
+@pytest.mark.parametrize(("sigma_px", "is_told"), [(0.5, True), (0.51, False)])
+def test_dots_within_a_pixel_may_be_why_no_lens_fits(sigma_px, is_told):
+    words = misfit_words("they are off", sigma_px)
+    assert words.startswith("they are off")
+    assert ("psf_sigma_px" in words) == is_told == (words != "they are off")
 
 
 def test_an_rms_of_dots_is_as_sure_as_it_is_over_many_draws(rng):

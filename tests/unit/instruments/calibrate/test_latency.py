@@ -63,7 +63,7 @@ def test_a_panel_s_delay_is_the_median_less_the_way_of_the_scan_to_the_square(tm
 
 
 @pytest.mark.parametrize("drift_ppm", [0.0, 100.0, -100.0])
-def test_a_device_s_own_times_are_microseconds_of_a_clock_of_its_own(monkeypatch, drift_ppm):
+def test_a_device_s_own_times_are_microseconds_of_a_clock_of_its_own(drift_ppm):
     """Edges that a slow line brings late in 200 s stand where the device saw them, which was
     switched on a quarter of an hour after the host.
     """
@@ -74,8 +74,7 @@ def test_a_device_s_own_times_are_microseconds_of_a_clock_of_its_own(monkeypatch
         (int(at + late), f"{k % 2},{device // 1000}".encode())
         for k, (at, late, device) in enumerate(zip(true_ns, late_ns, device_ns, strict=True))
     ]
-    monkeypatch.setattr(latency, "read_lines", lambda *_: lines)
-    edges = latency.capture_edges("/dev/none", 115200, 2.0)
+    edges = latency.edges_in(lines, "serial:/dev/none@115200")
     np.testing.assert_allclose(edges.host_ns - true_ns, 1_000_000, atol=100_000)
     assert edges.level.tolist() == [0, 1] * 20
 
@@ -234,17 +233,15 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path, small_bench_file):
     )
 
 
-def test_edges_of_which_some_have_no_time_of_the_device_s_are_those_of_their_arrival(monkeypatch):
+def test_edges_of_which_some_have_no_time_of_the_device_s_are_those_of_their_arrival():
     """And lines that are no edges are passed over."""
     lines = [(1000 * k, f"{k % 2},{k}".encode()) for k in range(20)]
     lines[7] = (7000, b"1")
     noise = [(5, b"2,1"), (6, b"hello"), (7, b"1,-3"), (8, b"")]
-    monkeypatch.setattr(latency, "read_lines", lambda *_: [*noise, *lines])
-    edges = latency.capture_edges("/dev/none", 115200, 2.0)
+    edges = latency.edges_in([*noise, *lines], "serial:/dev/none@115200")
     assert edges.host_ns.tolist() == [1000 * k for k in range(20)]
     assert edges.level.tolist() == [0, 1] * 10
-    monkeypatch.setattr(latency, "read_lines", lambda *_: lines[1:])
-    words = refusal(latency.capture_edges, "/dev/none", 115200, 2.0)
+    words = refusal(latency.edges_in, lines[1:], "serial:/dev/none@115200")
     assert words.startswith("serial:/dev/none@115200: 19 edges came, and at least 20 are needed")
 
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,6 +19,7 @@ from hilstar.instruments.calibrate.first_light.photometer import (
     FAINT_DN,
     LONGER,
     SHARE,
+    Assumed,
     DotField,
     LatticeRatio,
     Look,
@@ -39,6 +39,15 @@ from hilstar.instruments.calibrate.first_light.photometer import (
 )
 from hilstar.instruments.calibrate.plan import Patch
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
+from hilstar.tracker.rounding import rounding_rms
+from tests.support.closed_camera import (
+    DETECTOR_PX,
+    SIGMA_PX,
+    ClosedCamera,
+    closed_context,
+    power_of,
+)
+from tests.support.closed_camera import EXPOSURE_S as CLOSED_EXPOSURE_S
 
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 PIXELS = 50 * 60
@@ -53,22 +62,19 @@ def geometry(ratio: float = 1.5) -> BenchGeometry:
     )
 
 
-def photometer(**changes) -> Photometer:
-    """A photometer without a bench: lattices of 1 to 8 px on 64 x 64 px, black images of known
-    noise.
+@pytest.fixture
+def made(tmp_path) -> Photometer:
+    """A photometer on the closed bench, of two primaries: lattices of 1 to 8 px on 64 x 64 px, and
+    light of 0.25 DN an electron.
     """
-    made = object.__new__(Photometer)
-    made.field = DotField(0, 0, 64, slice(0, 50), slice(0, 60), monitor_px=1000.0)
-    made.periods = (1, 2, 4, 8)
-    made.exposure_s = EXPOSURE_S
-    made.longest_s = 10.0
-    made.assumed = SimpleNamespace(light={"r": None, "g": None})
-    made.scatter = PixelScatter(default_dn_per_e=0.25)
-    source = SimpleNamespace(sets_exposure=True)
-    made.context = SimpleNamespace(full_dn=4000.0, source=source)
-    for name, value in changes.items():
-        setattr(made, name, value)
-    return made
+    assumed = Assumed({"r": power_of(2.2), "g": power_of(2.2)}, 0.0)
+    context = closed_context(tmp_path, ClosedCamera())
+    photometer = Photometer(context, SIGMA_PX, assumed, longest_s=10.0)
+    photometer.field = DotField(0, 0, 64, slice(0, 50), slice(0, 60), monitor_px=1000.0)
+    photometer.periods = (1, 2, 4, 8)
+    photometer.exposure_s = EXPOSURE_S
+    photometer.scatter = PixelScatter(default_dn_per_e=0.25)
+    return photometer
 
 
 def scatter_of(dark_dn2: dict[int, float]) -> PixelScatter:
@@ -203,7 +209,7 @@ def test_a_lit_patch_is_above_the_black_of_its_own_exposure():
 @pytest.mark.parametrize(
     ("peaks_dn", "sets_exposure", "wanted"),
     [
-        # half of 4000 DN is the most; the densest that holds it
+        # half of 4095 DN is the most; the densest that holds it
         ((8000.0, 4000.0, 2000.0, 1500.0), True, Range(4)),
         ((9000.0, 8000.0, 7000.0, 6000.0), True, Range(8)),
         ((1000.0, 300.0, 100.0, 50.0), True, Range(1)),
@@ -216,36 +222,14 @@ def test_a_lit_patch_is_above_the_black_of_its_own_exposure():
     ],
 )
 def test_a_range_is_the_densest_that_holds_and_longer_where_that_is_faint(
-    peaks_dn, sets_exposure, wanted
+    made, peaks_dn, sets_exposure, wanted
 ):
-    made = photometer()
     made.context.source.sets_exposure = sets_exposure
     assert made._range(np.array(peaks_dn)) == wanted
 
 
-def test_a_pixel_s_light_is_the_sum_over_dots_exposures_and_ratios():
-    made = photometer()
-    made.scatter = scatter_of({1: 0.0, 4: 0.0})
-    patch = Patch(7, "r")
-    reading = _Reading(patch, Range(2, 4), 4096.0, 1.0)
-    factor = 1.02
-    made._rounded = lambda at, light_dn: np.zeros(16)
-    blacks = np.array([100.0, 130.0])
-    planned = [Patch(0, "r"), patch, Patch(0, "r")]
-    values = made._values(planned, {1: reading}, blacks, {("r", Range(2, 4)): factor})
-    # 32 x 32 dots, four exposures of half a second
-    per_dn = 1 / (1024 * 4 * EXPOSURE_S * factor)
-    assert values.light[1] == pytest.approx(4096 * per_dn)
-    assert values.per_dn[1] == pytest.approx(per_dn)
-    # of 4096 DN with 0.25 DN an electron
-    assert values.sigma[1] == pytest.approx(32.0 * per_dn)
-    # black is over 1000 monitor pixels, and about its own mean
-    assert values.light[[0, 2]] == pytest.approx(np.array([-15, 15]) / 1000 / EXPOSURE_S)
-
-
 @pytest.mark.parametrize("pairs", [1, 4])
-def test_a_ratio_is_as_sure_as_its_sums_and_their_number(pairs):
-    made = photometer()
+def test_a_ratio_is_as_sure_as_its_sums_and_their_number(made, pairs):
     made.scatter = scatter_of({1: 200.0, 4: 800.0})
     light_dn = (4000.0, 1000.0)
     ratios = (0.9,) * pairs
@@ -294,8 +278,7 @@ def ratio_of(channel: str, dense: Range, sparse: Range, ratio: float) -> Lattice
     )
 
 
-def test_ranges_are_tied_to_the_sparsest_lattice_link_by_link():
-    made = photometer()
+def test_ranges_are_tied_to_the_sparsest_lattice_link_by_link(made):
     links = [
         ratio_of("r", Range(1, 4), Range(1), 0.5),
         ratio_of("r", Range(1), Range(8), 0.8),
@@ -328,53 +311,34 @@ def test_light_passes_the_ratios_of_its_own_channel_from_its_range_on():
     assert not _passes(Patch(9, "g"), Range(1), link)
 
 
-def test_black_is_as_noisy_as_its_images_over_the_field_s_pixels():
-    made = photometer(scatter=scatter_of({1: 400.0}))
-    planned = [Patch(0, "w"), Patch(0, "w")]
-    values = made._values(planned, {}, np.array([5.0, 5.0]), {})
-    # 20 DN over 1000 monitor pixels and half a second
-    assert values.sigma == pytest.approx(20 / 1000 / EXPOSURE_S)
-    assert values.light.tolist() == [0.0, 0.0]
-
-
-def test_a_patch_s_peaks_are_white_s_on_the_sparsest_lattice_by_light_and_share():
-    made = photometer(shares=np.array([0.9, 0.6, 0.4, 0.3]))
-    made.assumed = SimpleNamespace(light={"w": np.array([0.0, 0.25, 1.0])})
+def test_a_patch_s_peaks_are_white_s_on_the_sparsest_lattice_by_light_and_share(made):
+    made.shares = np.array([0.9, 0.6, 0.4, 0.3])
+    made.assumed = Assumed({"w": np.array([0.0, 0.25, 1.0])}, 0.0)
     peaks = made._peaks([Patch(0, "w"), Patch(1, "w"), Patch(2, "w")], 1200.0)
     assert list(peaks) == [Patch(1, "w"), Patch(2, "w")]
     np.testing.assert_allclose(peaks[Patch(2, "w")], [3600, 2400, 1600, 1200])
     np.testing.assert_allclose(peaks[Patch(1, "w")], [900, 600, 400, 300])
 
 
-def with_detector(noise_e: float, offset_dn: float) -> Photometer:
-    """A photometer before a detector of 4 e- a DN, whose black pixels are at `offset_dn`."""
-    made = photometer(ratio=1.5)
-    detector = SimpleNamespace(electronics_e=noise_e, gain_e_per_dn=4.0, offset_dn=offset_dn)
-    made.context.detector = detector
+def test_what_the_adc_cuts_at_0_goes_by_a_dot_s_own_light(made):
+    """Of a noise of 1.5 DN, whose black pixels are at 0 DN, or 20 sigmas above that."""
     made.profiles = {period: lattice_profile(period, 1.5, 0.9) for period in made.periods}
-    made.scatter = PixelScatter(default_dn_per_e=0.25)
-    made.scatter.add(BLACK, Range(1), np.full((50, 60), offset_dn))
-    return made
-
-
-def test_what_the_adc_cuts_at_0_goes_by_a_dot_s_own_light():
-    made = with_detector(8.0, 0.0)
-    wide = with_detector(8.0, 0.0)
-    wide.field = replace(made.field, side=128)
-    light_dn = 2000.0
-    for at in (Range(4), Range(8)):
-        cut_dn = made._cut_dn(at, light_dn)
-        assert cut_dn != pytest.approx(0.0, abs=1.0)
+    made.scatter.add(BLACK, Range(1), np.zeros((50, 60)))
+    light_dn, lattices = 2000.0, (Range(4), Range(8))
+    cut_dn = [made._cut_dn(at, light_dn) for at in lattices]
+    rounded_dn = [made._rounded(at, light_dn) for at in lattices]
+    made.field = replace(made.field, side=128)
+    for at, of_cut, of_rounding in zip(lattices, cut_dn, rounded_dn, strict=True):
+        assert of_cut != pytest.approx(0.0, abs=1.0)
         # four times as many dots of the same light
-        assert wide._cut_dn(at, 4 * light_dn) == pytest.approx(4 * cut_dn)
-        assert wide._rounded(at, 4 * light_dn) == pytest.approx(4 * made._rounded(at, light_dn))
-    # an offset of 20 sigmas is never cut
-    safe = with_detector(8.0, 40.0)
-    assert safe._cut_dn(Range(4), light_dn) == pytest.approx(0.0, abs=1e-6)
+        assert made._cut_dn(at, 4 * light_dn) == pytest.approx(4 * of_cut)
+        assert made._rounded(at, 4 * light_dn) == pytest.approx(4 * of_rounding)
+    made.scatter = PixelScatter(default_dn_per_e=0.25)
+    made.scatter.add(BLACK, Range(1), np.full((50, 60), 30.0))
+    assert made._cut_dn(Range(4), light_dn) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_rounding_of_both_sums_of_a_ratio_is_taken_off_one_another():
-    made = photometer()
+def test_rounding_of_both_sums_of_a_ratio_is_taken_off_one_another(made):
     pair = _Pair(Patch(9, "r"), Range(1), Range(2), (1000.0, 1000.0), (1.0,))
     made._rounded = lambda at, light_dn: np.full(16, 30.0)
     link = ratio_of("r", Range(1), Range(2), 1.0)
@@ -389,9 +353,8 @@ def test_rounding_of_both_sums_of_a_ratio_is_taken_off_one_another():
     np.testing.assert_allclose((modes**2).sum(), (0.3 - 0.15) ** 2, rtol=1e-6)
 
 
-def test_a_code_brighter_than_stated_is_read_shorter_and_then_on_the_next_lattice():
+def test_a_code_brighter_than_stated_is_read_shorter_and_then_on_the_next_lattice(made):
     """Until it does not saturate; once read, it stays where it is."""
-    made = photometer()
     taken = []
 
     def look(name, at, patch):
@@ -423,24 +386,27 @@ def test_a_ratio_is_said_with_each_lattice_s_own_exposure():
 
 
 @pytest.mark.parametrize("even_relative", [0.0, 0.1])
-def test_black_is_the_mean_of_two_screens_over_one_that_is_off(even_relative):
-    """Screens of 100 DN a pixel that differ by 2 DN, and 60 DN without glow; no rounding."""
-    made = photometer(_even_relative=even_relative, images=[], _dark_screen="first")
-    parts = {"first": np.full((50, 60), 99.0), "again": np.full((50, 60), 101.0)}
-    parts["unlit"] = np.full((50, 60), 60.0)
-    made._part = parts.__getitem__
-    made._black_screen = lambda number: f"black {number}"
-    made._noise_dn = lambda variance_dn2, sum_dn: 50.0
-    made.context.unlit = lambda: "unlit"
-    made.context.take = {"black 1": "again"}.__getitem__
-    made.context.exposure_s = 0.2
+def test_black_is_the_mean_of_two_screens_over_one_that_is_off(tmp_path, made, even_relative):
+    """Screens of 100 DN a pixel that differ by 2 DN, and 60 DN without glow; rounding is hidden by
+    a noise of 2 DN.
+    """
+    levels_dn = {"black_screen_0": 99.0, "black_screen_1": 101.0, "unlit_000": 60.0}
+    paths = {name: tmp_path / f"{name}.png" for name in levels_dn}
+    camera = made.context.source
+    for name, level_dn in levels_dn.items():
+        camera.images[paths[name]] = np.full(DETECTOR_PX[::-1], level_dn)
+    made.context = replace(made.context, images=paths)
+    made._dark_screen = paths["black_screen_0"]
+    made._even_relative, made.images = even_relative, []
     light, error = made._with_black([], np.array([3.0, 7.0]))
-    seconds = 1000.0 * 0.2
+    seconds = 1000.0 * CLOSED_EXPOSURE_S
     more_dn = 40.0 * PIXELS
     np.testing.assert_allclose(light, np.array([3.0, 7.0]) + more_dn / seconds)
     screens_dn2 = 2.0**2 * PIXELS / 2
     # of the mean of two, and of one whose glow has no shot noise: more than there is
     variance = screens_dn2 / 2 + max(screens_dn2 - 0.25 * more_dn, 0.0)
+    for image_dn2, sum_dn in ((screens_dn2, 100 * PIXELS), (0.0, 60 * PIXELS)):
+        variance += (PIXELS * rounding_rms(made._noise_dn(image_dn2, sum_dn))) ** 2
     variance += (even_relative * more_dn) ** 2
     assert error == pytest.approx(math.sqrt(variance) / seconds, rel=1e-6)
-    assert made.images == ["again", "unlit"]
+    assert made.images == [paths["black_screen_1"], paths["unlit_000"]]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,51 +18,70 @@ from hilstar.instruments.calibrate.scale import (
     with_flux_at_white,
 )
 from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.config import read_config
+from tests.support.benches import bench_text
+from tests.support.refusals import refusal
 
 MAG = 2.5 / math.log(10)
 
 
-def bench_of(rates, *, white=1e6, faintest=10.0):
-    return SimpleNamespace(
-        config=SimpleNamespace(
-            tracker=SimpleNamespace(detector=SimpleNamespace(gain_e_per_dn=4.0))
-        ),
-        stars=SimpleNamespace(hip=np.arange(len(rates)) + 1, electrons_per_s=np.array(rates)),
-        psf=SimpleNamespace(peak_share=0.5),
-        flux_at_white_e_per_s=white,
-        faintest_shown_e_per_s=faintest,
-    )
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    """A bench of 4 e- a DN."""
+    path = tmp_path_factory.mktemp("scale") / "bench.toml"
+    tables = {"sky": {"faintest_v_mag": 4.0}, "tracker.detector": {"gain_e_per_dn": 4.0}}
+    path.write_text(bench_text(tables, {"render": {"quantisation": "round"}}))
+    with open_bench(read_bench_file(path)) as made:
+        yield made
 
 
-def test_white_is_as_much_brighter_as_its_stars():
-    bench = bench_of([1000.0, 4000.0, 2000.0])
-    # 4 e per DN in 0.2 s: 1.1 of what is wanted, 0.9 and 1.3
-    readings = [StarReading(1, 55.0), StarReading(2, 180.0), StarReading(3, 130.0)]
-    found = scale_by_tracker(bench, readings, 0.2)
+def readings_of(bench, ratios, exposure_s, sigmas=None):
+    """Of the faintest stars so much of the light that is wanted, each with its relative noise."""
+    faintest = np.argsort(bench.stars.electrons_per_s)[: len(ratios)]
+    readings = []
+    for star, ratio, sigma in zip(faintest, ratios, sigmas or [0.0] * len(ratios), strict=True):
+        dn = ratio * float(bench.stars.electrons_per_s[star]) * exposure_s / 4.0
+        readings.append(StarReading(int(bench.stars.hip[star]), dn, sigma * dn))
+    return readings
+
+
+def test_white_is_as_much_brighter_as_its_stars(bench):
+    found = scale_by_tracker(bench, readings_of(bench, [1.1, 0.9, 1.3], 0.2), 0.2)
     np.testing.assert_allclose(found.ratios, [1.1, 0.9, 1.3])
-    assert found.flux_at_white_e_per_s == pytest.approx(1.1e6)
-    assert (found.assumed_e_per_s, found.dof, found.noise_mag) == (1e6, 2, 0.0)
+    white = bench.flux_at_white_e_per_s
+    assert found.flux_at_white_e_per_s == pytest.approx(1.1 * white)
+    assert (found.assumed_e_per_s, found.dof, found.noise_mag) == (white, 2, 0.0)
 
 
-def test_noise_of_a_reading_is_relative_to_it():
-    readings = [StarReading(1, 100.0, 2.0), StarReading(2, 50.0, 0.5)]
-    found = scale_by_tracker(bench_of([500.0, 250.0]), readings, 1.0)
-    weights = [1 / ((MAG * share) ** 2 + STAR_MAG**2) for share in (0.02, 0.01)]
+def test_noise_of_a_reading_is_relative_to_it(bench):
+    shares = [0.02, 0.01]
+    found = scale_by_tracker(bench, readings_of(bench, [0.8, 0.8], 1.0, shares), 1.0)
+    weights = [1 / ((MAG * share) ** 2 + STAR_MAG**2) for share in shares]
     np.testing.assert_allclose(found.weights, weights)
     assert found.noise_mag == pytest.approx(sum(weights) ** -0.5)
 
 
 @pytest.mark.parametrize(
-    ("rate", "found"), [(2.1e6, "clips"), (1.9e6, None), (9.9, "too faint"), (10.1, None)]
+    ("key", "share", "found"),
+    [
+        ("flux_at_white_e_per_s", 0.95, "clips"),
+        ("flux_at_white_e_per_s", 1.05, None),
+        ("faintest_shown_e_per_s", 1.01, "too faint"),
+        ("faintest_shown_e_per_s", 0.99, None),
+    ],
 )
-def test_a_star_is_read_between_what_clips_and_what_is_not_shown(rate, found):
-    reading = [StarReading(1, 100.0)]
+def test_a_star_is_read_between_what_clips_and_what_is_not_shown(bench, key, share, found):
+    """A limit is so much of a star's light, in its brightest pixel or in all."""
+    rate = float(bench.stars.electrons_per_s.min())
+    if key == "flux_at_white_e_per_s":
+        rate *= bench.psf.peak_share
+    limited = replace(bench, **{key: share * rate})
+    readings = readings_of(bench, [1.0], 1.0)
     if found is None:
-        assert scale_by_tracker(bench_of([rate]), reading, 1.0).dof == 0
+        assert scale_by_tracker(limited, readings, 1.0).dof == 0
     else:
-        with pytest.raises(Exception, match=found):
-            scale_by_tracker(bench_of([rate]), reading, 1.0)
+        assert found in refusal(scale_by_tracker, limited, readings, 1.0)
 
 
 def test_the_scatter_is_of_a_sample_and_the_error_of_its_median():

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,27 +16,33 @@ from scipy.special import erf, ndtr
 from hilstar.display.geometry import monitor_camera
 from hilstar.display.panel import Panel
 from hilstar.display.response import Levels, table_response
-from hilstar.instruments.calibrate.first_light import seen_stars
+from hilstar.instruments.calibrate.first_light.context import DarkSubtracted
 from hilstar.instruments.calibrate.first_light.photometer import PixelScatter, Range, monitor_area
 from hilstar.instruments.calibrate.first_light.seen_stars import (
     Beyond,
     ExpectedStars,
+    ImageLimits,
     Scatter,
     StarSpot,
     StarsSeen,
-    _alone,
-    _codes_mag,
-    _compared,
     _fields,
     _mean_dark,
+    codes_mag,
+    compared,
+    difference_noise_dn,
+    from_middle,
     see_stars,
+    stars_alone,
 )
 from hilstar.instruments.calibrate.first_light.stars import frames_for, place_reasons
 from hilstar.instruments.calibrate.plan import Patch
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
+from hilstar.optics.layers.truth import TRUTH_DTYPE
+from hilstar.server.bench.build import open_bench
 from hilstar.tracker.centroids import noisiest_background
 from hilstar.tracker.rounding import rounded_light
-from tests.support.closed_camera import AXIS_PX, DETECTOR_PX, ClosedCamera, closed_context
+from tests.support.closed_camera import AXIS_PX, DETECTOR_PX, RATIO, ClosedCamera, closed_context
+from tests.support.seen_stars import stars_seen
 
 WIDE = StarSpot((0.9, 1.4), gain_e_per_dn=4.0, prnu=0.0, electronics_dn=0.0)
 MAG_A_RELATIVE = 2.5 / np.log(10)
@@ -111,26 +117,20 @@ def test_a_scatter_beyond_noise_is_between_its_bounds(rng, scatter):
         assert min(over, under) > 0
 
 
-def seen(rng, *, place_noise_px=0.01, off_px=0.0, count: int = 200, frames: int = 4) -> StarsSeen:
-    """Stars all over the screen, off by an error beside the noise of their places, rms."""
-    noise_px = np.full(count, place_noise_px)
+def seen(rng, *, place_noise_px=0.01, off_px=0.0, count: int = 200, **columns) -> StarsSeen:
+    """Stars all over the screen in four frames, off by an error beside the noise of their places,
+    rms.
+    """
     residual_px = rng.standard_normal((count, 2))
     residual_px *= np.hypot(off_px, place_noise_px) / np.sqrt((residual_px**2).mean())
-    return StarsSeen(
-        hip=np.arange(count, dtype=np.int32),
-        place_px=np.zeros((count, 2)),
-        residual_px=residual_px,
-        place_noise_px=noise_px,
-        dn=np.ones(count),
-        e_per_s=np.exp(rng.uniform(0, 5, count)),
-        noise_mag=np.full(count, 0.01),
-        rounding_mag=np.zeros((count, 1)),
-        screen=rng.uniform(-1, 1, (count, 2)),
-        codes_mag=np.zeros(count),
-        lost=0,
-        frames=frames,
-        images=(),
-    )
+    all_over = {
+        "residual_px": residual_px,
+        "place_noise_px": np.full(count, place_noise_px),
+        "e_per_s": np.exp(rng.uniform(0, 5, count)),
+        "screen": rng.uniform(-1, 1, (count, 2)),
+        "frames": 4,
+    }
+    return stars_seen(**all_over | columns)
 
 
 def test_what_follows_place_or_light_is_told_apart(rng):
@@ -150,8 +150,8 @@ def test_what_follows_place_or_light_is_told_apart(rng):
     assert stars.scatter(noise + 7.0, used).finding == ""
     # what the codes are known to cost is no scatter
     codes_mag = 0.3 * rng.standard_normal(200)
-    object.__setattr__(stars, "codes_mag", codes_mag)
-    assert stars.scatter(codes_mag + noise, used).finding == ""
+    coarse = replace(stars, codes_mag=codes_mag)
+    assert coarse.scatter(codes_mag + noise, used).finding == ""
     assert Scatter(0.031, 0.01, 0.0, 0.0).finding != "" == Scatter(0.029, 0.01, 0.0, 0.0).finding
 
 
@@ -176,21 +176,21 @@ def test_a_window_is_three_sigmas_of_the_wider_axis_and_four_pixels_or_more(sigm
     ],
 )
 def test_stars_are_sure_by_their_noise_or_by_being_the_few_with_the_least(rng, noise_mag, sure):
-    stars = replace(seen(rng, count=len(sure)), noise_mag=np.array(noise_mag))
+    stars = seen(rng, count=len(sure), noise_mag=np.array(noise_mag))
     assert stars.sure.tolist() == sure
 
 
 def test_places_are_refused_by_what_is_sure_and_frames_asked_for_by_what_is_not(rng):
     limit_px = 0.1
-    sure = seen(rng, off_px=0.2)
-    assert "run the geometry again" in place_reasons(sure, limit_px)[0]
-    assert frames_for(sure, limit_px) == 4
-    well = seen(rng, off_px=0.0)
-    assert place_reasons(well, limit_px) == []
-    doubtful = seen(rng, place_noise_px=0.3, count=40)
-    frames = frames_for(doubtful, limit_px)
+    sure = seen(rng, off_px=0.2).beyond_px
+    assert "run the geometry again" in place_reasons(sure, 4, limit_px)[0]
+    assert frames_for(sure, 4, limit_px) == 4
+    well = seen(rng, off_px=0.0).beyond_px
+    assert place_reasons(well, 4, limit_px) == []
+    doubtful = seen(rng, place_noise_px=0.3, count=40).beyond_px
+    frames = frames_for(doubtful, 4, limit_px)
     assert frames > 4
-    assert f"--average {frames}" in place_reasons(doubtful, limit_px)[0]
+    assert f"--average {frames}" in place_reasons(doubtful, 4, limit_px)[0]
 
 
 def test_images_of_one_pattern_tell_noise_and_dn_an_electron(rng):
@@ -246,18 +246,21 @@ def test_codes_are_summed_over_the_tracker_s_window_on_the_monitor():
     """
     spot = StarSpot((0.7, 0.9), 4.0, 0.0, 0.0)
     assert spot.radius_px == 4
+    upright = np.array([1.0, 0.0, 0.0, 0.0])
+    geometry = BenchGeometry(
+        monitor_camera((80, 60), 50.0, 80.0, upright), monitor_camera((40, 30), 50.0, 40.0, upright)
+    )
+    reach = spot.reach_on_screen(geometry)
+    assert reach == 9
     levels = np.zeros((60, 80), dtype=np.uint16)
     x, y = 50, 25
     levels[y - 9 : y + 10, x - 9 : x + 10] = 3
     levels[y - 8 : y + 9, x - 8 : x + 9] = 0
-    cameras = [SimpleNamespace(focal_length_px=f) for f in (1600.0, 800.0)]
-    geometry = SimpleNamespace(monitor=cameras[0], tracker=cameras[1])
-    context = SimpleNamespace(geometry=lambda: geometry)
-    bench = SimpleNamespace(panel=Panel(table_response(2, np.array([0.0, 0.1, 0.4, 1.0])), 7.0))
-    frame = SimpleNamespace(linear=np.ones((60, 80), dtype=np.float32))
+    panel = Panel(table_response(2, np.array([0.0, 0.1, 0.4, 1.0])), 7.0)
+    linear = np.ones((60, 80), dtype=np.float32)
     places = np.array([[50.2, 24.9], [10.0, 50.0]])
     both = (Levels(levels), Levels(np.zeros_like(levels)))
-    (off_mag, dark_mag) = _codes_mag(bench, context, frame, both, places, spot)
+    (off_mag, dark_mag) = codes_mag(linear, both, panel, places, reach)
     ring = 19**2 - 17**2
     # in one of two frames, of white's 7 electrons per second
     assert off_mag == pytest.approx(-2.5 * np.log10(7.0 * ring / 2 / 19**2))
@@ -269,39 +272,29 @@ def test_as_many_frames_are_asked_for_as_bring_the_doubt_to_the_limit(frames):
     """The doubt of a scatter's square shrinks with the number of frames."""
     p95_of_two = 2.4477
     for sigma_px, high_px in ((0.02, 0.09), (0.0, 0.3), (0.038, 0.06)):
-        beyond = SimpleNamespace(sigma=sigma_px, low=0.0, high=high_px)
+        beyond = Beyond(sigma_px, 0.0, high_px)
         limit_px = 0.1
         limit = limit_px / p95_of_two
         room = max(limit**2 - sigma_px**2, limit**2 / 4)
         wanted = math.ceil(frames * (high_px**2 - sigma_px**2) / room)
-        asked = frames_for(SimpleNamespace(beyond_px=beyond, frames=frames), limit_px)
-        assert asked == max(wanted, frames + 1)
-    sure = SimpleNamespace(sigma=0.01, low=0.0, high=0.04)
-    assert frames_for(SimpleNamespace(beyond_px=sure, frames=frames), 0.1) == frames
+        assert frames_for(beyond, frames, limit_px) == max(wanted, frames + 1)
+    assert frames_for(Beyond(0.01, 0.0, 0.04), frames, 0.1) == frames
 
 
-def test_fields_have_the_most_stars_that_both_tracker_and_screen_have(tmp_path, rng):
-    """Of a screen that covers a fifth of the tracker's field; all stars are alike."""
-    screen = {
+def test_fields_have_the_most_stars_that_both_tracker_and_screen_have(tmp_path):
+    """Of a screen that covers a fifth of the tracker's field; all but the sky's few
+    brightest stars are readable."""
+    bright = {
         "monitor": {"resolution_px": [64, 60]},
         "collimator": {"principal_point_px": [30.0, 32.0]},
+        "render": {"flux_at_white_e_per_s": 1e12},
+        "tracker.detector": {"gain_e_per_dn": 100.0, "full_well_e": 1e9, "bits": 16},
     }
-    context = closed_context(tmp_path, ClosedCamera(), screen)
-    vectors = rng.normal(size=(9000, 3))
-    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
-    stars = SimpleNamespace(
-        electrons_per_s=np.full(9000, 20_000.0),
-        row=np.arange(9000),
-        directions=lambda chosen: vectors[chosen],
-    )
-    bench = SimpleNamespace(
-        stars=stars,
-        psf=SimpleNamespace(peak_share=0.3),
-        flux_at_white_e_per_s=1e6,
-        camera=context.real_geometry().monitor,
-    )
+    context = closed_context(tmp_path, ClosedCamera(), bright)
     spot = StarSpot((0.9, 0.9), 4.0, 0.0, 0.0)
-    fields = _fields(bench, context, spot, noise_dn=2.0)
+    with open_bench(context.file) as bench:
+        fields = _fields(bench, context, spot, noise_dn=0.5)
+        vectors = bench.stars.directions(np.flatnonzero(bench.stars.row >= 0))
     assert len(fields) >= 3
     counts = []
     for q in fields:
@@ -319,30 +312,23 @@ def test_fields_have_the_most_stars_that_both_tracker_and_screen_have(tmp_path, 
             inside &= (row > margin_px) & (row < size_px[1] - margin_px)
         counts.append(int(inside.sum()))
     assert counts == sorted(counts, reverse=True)
-    # the screen has 3.3 x 3.0 degrees without its margins: 2 stars on average
+    # the screen has 3.3 x 3.0 degrees without its margins
     assert counts[0] >= 4
 
 
-def test_a_star_is_as_wide_as_its_sprite_its_pixels_and_the_psf_of_the_focus(monkeypatch):
-    """The focus found the PSF twice as wide as the bench file has it; half a pixel of the tracker's
-    to one of the monitor's.
-    """
-    cameras = [SimpleNamespace(focal_length_px=f) for f in (1600.0, 800.0)]
-    geometry = SimpleNamespace(monitor=cameras[0], tracker=cameras[1])
-    context = SimpleNamespace(
-        geometry=lambda: geometry,
-        file=SimpleNamespace(config=None, folder=None),
-        tracker_psf=SimpleNamespace(width_px=(0.6, 1.0)),
-        psf_sigma_px=1.6,
-        detector=SimpleNamespace(gain_e_per_dn=4.0, prnu=0.01, electronics_e=10.0),
-    )
-    sprite = SimpleNamespace(width_px=(1.2, 0.9))
-    monkeypatch.setattr(seen_stars, "display_psf", lambda config, folder, monitor: sprite)
-    spot = StarSpot.of(context)
+def test_a_star_is_as_wide_as_its_sprite_its_pixels_and_the_psf_of_the_focus(tmp_path):
+    """The focus found the PSF twice as wide as the bench file has it."""
+    bench = {
+        "tracker": {"psf_sigma_px": [0.6, 1.0]},
+        "render": {"sprite_sigma_px": [1.2, 0.9]},
+        "tracker.detector": {"prnu": 0.01, "read_noise_e": 10.0},
+    }
+    known = {"focus.psf_sigma_px": 1.6}
+    spot = StarSpot.of(closed_context(tmp_path, ClosedCamera(), bench, known=known))
     # the square of light and that of the drawing's pixel: a twelfth each
     wanted = (
-        math.sqrt(1.2**2 + (1.2**2 + 1 / 6) / 4),
-        math.sqrt(2.0**2 + (0.9**2 + 1 / 6) / 4),
+        math.hypot(1.2, RATIO * math.sqrt(1.2**2 + 1 / 6)),
+        math.hypot(2.0, RATIO * math.sqrt(0.9**2 + 1 / 6)),
     )
     assert spot.sigma_px == pytest.approx(wanted)
     assert (spot.gain_e_per_dn, spot.prnu, spot.electronics_dn) == (4.0, 0.01, 2.5)
@@ -356,85 +342,67 @@ def test_each_star_s_place_counts_by_its_own_noise(rng):
     assert stars.beyond_px.sigma == pytest.approx(0.0, abs=1e-9)
 
 
-def test_fields_are_shown_over_the_noise_of_an_image_less_its_dark_one(monkeypatch, rng):
+def test_an_image_less_a_dark_one_has_the_noise_of_both(rng):
     dark = 50 + rng.normal(0, 2.0, (90, 120))
-    asked = []
-    names = []
-
-    def shown(context, spot, noise_dn):
-        asked.append(noise_dn)
-        field = SimpleNamespace(codes=(np.zeros((2, 2), dtype=np.uint16),), expected=None)
-        return [field, field]
-
-    def compared(context, patterns, dark, expected, spot):
-        names.append([pattern.name for pattern in patterns])
-        return replace(seen(rng, count=3), lost=1, images=(patterns[0].name,))
-
-    monkeypatch.setattr(seen_stars.StarSpot, "of", lambda context: WIDE)
-    monkeypatch.setattr(seen_stars, "_mean_dark", lambda context, frames: (dark, ("dark",)))
-    monkeypatch.setattr(seen_stars, "_shown_fields", shown)
-    monkeypatch.setattr(seen_stars, "_compared", compared)
-    stars = see_stars(None, frames=3)
-    assert asked == [pytest.approx(math.sqrt(2) * noisiest_background(dark).noise)]
-    assert names == [
-        ["stars_000", "stars_000_01", "stars_000_02"],
-        ["stars_001", "stars_001_01", "stars_001_02"],
-    ]
-    assert (len(stars.dn), stars.lost, stars.frames) == (6, 2, 3)
-    assert stars.images == ("dark", "stars_000", "stars_001")
+    noise_dn = math.sqrt(2) * noisiest_background(dark).noise
+    assert difference_noise_dn(dark) == pytest.approx(noise_dn)
 
 
-def test_a_mean_dark_is_a_mean():
-    images = {0: np.full((2, 3), 10.0), 1: np.full((2, 3), 14.0)}
-    context = SimpleNamespace(dark=lambda number: number, read=images.get)
-    dark, paths = _mean_dark(context, 2)
-    assert dark.tolist() == [[12.0] * 3] * 2
-    assert paths == (0, 1)
+def test_fields_are_shown_as_often_as_they_are_averaged(tmp_path):
+    camera = ClosedCamera()
+    context = closed_context(tmp_path, camera)
+    stars = see_stars(context, frames=2)
+    names = [name for name, _ in camera.taken]
+    fields = (len(names) - 2) // 2
+    wanted = ["dark_000", "dark_001"]
+    for number in range(fields):
+        wanted += [f"stars_{number:03}", f"stars_{number:03}_01"]
+    assert fields >= 3 and names == wanted
+    assert [path.stem for path in stars.images] == names
+    assert stars.frames == 2
 
 
-def test_stars_that_are_compared_are_alone_whole_within_both_edges_and_no_planets(monkeypatch):
+def test_a_mean_dark_is_a_mean(tmp_path):
+    camera = ClosedCamera()
+    dark, paths = _mean_dark(closed_context(tmp_path, camera), 2)
+    first, second = (camera.images[path] for path in paths)
+    assert (first != second).any()
+    np.testing.assert_allclose(dark, (first + second) / 2)
+
+
+def test_stars_that_are_compared_are_alone_whole_within_both_edges_and_no_planets():
     """A tracker of 200 x 150 px; places on it and on a screen of 401 x 301 px, a star a row."""
     rows = [
-        # hip, place, screen, light, drawn, clipped, catalogue's row
-        (1, (100, 75), (250, 100), 100.0, 1, 0, 4),
-        (2, (60, 75), (100, 200), 100.0, 1, 0, -1),  # a planet
-        (3, (30, 30), (200, 150), 100.0, 0, 0, 5),  # not drawn
-        (4, (30, 60), (200, 150), 100.0, 1, 1, 6),  # clipped
-        (5, (11, 100), (200, 150), 100.0, 1, 0, 7),  # at the tracker's edge
-        (6, (150, 40), (395, 150), 100.0, 1, 0, 8),  # at the screen's
-        (7, (150, 100), (200, 290), 100.0, 1, 0, 9),
-        (8, (150, 107), (200, 150), 1.0, 1, 0, 10),  # beside a brighter one
-        (9, (160, 20), (200, 150), 100.0, 1, 0, 11),
-        (10, (165, 20), (210, 150), 0.09, 1, 0, 12),  # too faint to disturb that
-        (11, (np.nan, np.nan), (200, 150), 100.0, 1, 0, 13),
-        (12, (20, 130), (40, 280), 100.0, 1, 0, 14),
+        # hip, place, screen, light, drawn, clipped
+        (1, (100, 75), (250, 100), 100.0, 1, 0),
+        (0, (60, 75), (100, 200), 100.0, 1, 0),  # a planet
+        (3, (30, 30), (200, 150), 100.0, 0, 0),  # not drawn
+        (4, (30, 60), (200, 150), 100.0, 1, 1),  # clipped
+        (5, (11, 100), (200, 150), 100.0, 1, 0),  # at the tracker's edge
+        (6, (150, 40), (395, 150), 100.0, 1, 0),  # at the screen's
+        (7, (150, 100), (200, 290), 100.0, 1, 0),
+        (8, (150, 107), (200, 150), 1.0, 1, 0),  # beside a brighter one
+        (9, (160, 20), (200, 150), 100.0, 1, 0),
+        (10, (165, 20), (210, 150), 0.09, 1, 0),  # too faint to disturb that
+        (11, (np.nan, np.nan), (200, 150), 100.0, 1, 0),
+        (12, (20, 130), (40, 280), 100.0, 1, 0),
     ]
     columns = [np.array(column) for column in zip(*rows, strict=True)]
-    hip, place, screen, light, drawn, clipped, row = columns
-    truth = {
-        "hip": hip,
-        "x_px": screen[:, 0],
-        "y_px": screen[:, 1],
-        "electrons_per_s": light,
-        "drawn": drawn.astype(bool),
-        "clipped": clipped.astype(bool),
-    }
-    camera = SimpleNamespace(project=lambda in_cam: place.T, resolution_px=(200, 150))
-    frame = SimpleNamespace(rows=truth, star=np.arange(12), q_icrs_to_cam=np.array([1.0, 0, 0, 0]))
-    stars = SimpleNamespace(directions=lambda star: np.zeros((len(star), 3)), row=row)
-    context = SimpleNamespace(
-        file=SimpleNamespace(config=SimpleNamespace(tracker=None), folder=None),
-        resolution_px=(401, 301),
-    )
-    monkeypatch.setattr(seen_stars, "tracker_camera", lambda settings, folder: camera)
-    monkeypatch.setattr(seen_stars, "_codes_mag", lambda *given: given[4][:, 0] / 100)
+    hip, place, screen, light, drawn, clipped = columns
+    truth = np.zeros(len(rows), dtype=TRUTH_DTYPE)
+    truth["hip"], truth["electrons_per_s"] = hip, light
+    truth["x_px"], truth["y_px"] = screen.T
+    truth["drawn"], truth["clipped"] = drawn, clipped
     spot = StarSpot((1.0, 1.0), 4.0, 0.0, 0.0)
-    alone = _alone(SimpleNamespace(stars=stars), context, frame, (), spot)
-    assert alone.hip.tolist() == [1, 9, 12]
-    assert alone.place_px.tolist() == [[100, 75], [160, 20], [20, 130]]
+    row = np.where(hip > 0, hip + 3, -1)
+    is_alone = stars_alone(truth, row, place, ((200, 150), (401, 301)), spot)
+    assert hip[is_alone].tolist() == [1, 9, 12]
+
+
+def test_a_place_on_the_screen_is_from_its_middle():
+    screen_px = np.array([[250.0, 100.0], [200.0, 150.0], [40.0, 280.0]])
     wanted = [[0.25, -1 / 3], [0.0, 0.0], [-0.8, 130 / 150]]
-    np.testing.assert_allclose(alone.screen, wanted)
-    np.testing.assert_allclose(alone.codes_mag, [2.5, 2.0, 0.4])
+    np.testing.assert_allclose(from_middle(screen_px, (401, 301)), wanted)
 
 
 def test_stars_are_measured_in_the_mean_of_images_of_a_screen_that_is_half_as_bright(rng):
@@ -456,12 +424,11 @@ def test_stars_are_measured_in_the_mean_of_images_of_a_screen_that_is_half_as_br
     drawn = np.einsum("n,ny,nx->yx", dn, axes[1], axes[0])
     exposure_s, floor_dn = 0.5, 600.0
 
-    def look(pattern, dark):
-        return SimpleNamespace(
-            path=pattern, image=drawn + rng.normal(0, noise_dn, drawn.shape), floor_dn=floor_dn
-        )
-
-    context = SimpleNamespace(look=look, exposure_s=exposure_s, full_dn=4095)
+    paths = tuple(Path(f"{name}.png") for name in "abcd")
+    looked = [
+        DarkSubtracted(path, drawn + rng.normal(0, noise_dn, drawn.shape), 0.0, floor_dn)
+        for path in paths
+    ]
     none = np.zeros((9, 2))
     wanted = ExpectedStars(
         hip=np.arange(9, dtype=np.int32),
@@ -470,9 +437,9 @@ def test_stars_are_measured_in_the_mean_of_images_of_a_screen_that_is_half_as_br
         screen=none,
         codes_mag=none[:, 0],
     )
-    stars = _compared(context, ["a", "b", "c", "d"], None, wanted, spot)
+    stars = compared(iter(looked), wanted, spot, ImageLimits(exposure_s, 4095))
     assert stars.hip.tolist() == [0, 1, 2, 3, 4, 5, 6]
-    assert (stars.images, stars.frames) == (("a", "b", "c", "d"), 4)
+    assert (stars.images, stars.frames) == (paths, 4)
     np.testing.assert_allclose(stars.dn, dn[:7], rtol=0.03)
     # 0.8 of 4095 DN, of which the dark level has 600: 2676 DN; the brightest has 3500 in a pixel
     assert 2676 < drawn.max() < 0.8 * 4095 + floor_dn

@@ -5,30 +5,77 @@ judgements of its images.
 from __future__ import annotations
 
 import os
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from hilstar.display.identity import MonitorIdentity
 from hilstar.instruments.calibrate.first_light.context import (
+    DarkSubtracted,
     FittedFigure,
-    StepContext,
     StepOutcome,
+    StepRecord,
 )
-from hilstar.instruments.calibrate.first_light.image_sources import VirtualBench, complete_images
+from hilstar.instruments.calibrate.first_light.image_sources import complete_images
 from hilstar.instruments.calibrate.first_light.photometer import _seen
-from hilstar.instruments.calibrate.first_light.session import STEPS, FirstLightSession
+from hilstar.instruments.calibrate.first_light.session import (
+    FIRST_LIGHT,
+    STEPS,
+    FirstLightSession,
+    SessionPlan,
+    SessionStep,
+    origin_of,
+    state_sha256,
+)
+from hilstar.instruments.simulate.bench_geometry import BenchGeometry
+from hilstar.optics.camera import Camera
 from hilstar.server.bench.bench_file import BenchConfig
+from tests.support.benches import Tables
+from tests.support.closed_camera import DETECTOR_PX, FULL_DN, ClosedCamera, closed_context
 from tests.support.refusals import refusal
 
 
-def state_of(folder, number: int, config: dict[str, dict[str, int]], monitor=None) -> str:
-    """The state of a step by a bench file's tables, on a monitor."""
-    session = SimpleNamespace(
-        file=SimpleNamespace(config=config, folder=folder),
-        source=SimpleNamespace(identity="a camera", monitor=monitor),
+def session_of(folder, patches: int = 5, *changes: Tables) -> FirstLightSession:
+    """A session on the closed bench."""
+    context = closed_context(folder, ClosedCamera(), *changes)
+    return FirstLightSession(folder / "s", context.file, context.source, patches)
+
+
+def record(name: str, verdict: str, state: str = "", **figures: float) -> StepRecord:
+    """A step that has ended so."""
+    return StepRecord(
+        name=name,
+        verdict=verdict,
+        line="",
+        exit_code=0,
+        state_sha256=state,
+        figures=figures,
+        files={},
+        pictures=[],
+        changes=[],
+        ended="",
+        seconds=0.0,
     )
-    return FirstLightSession._state(session, number)
+
+
+def test_later_keys_are_those_of_the_steps_after_one():
+    steps = (
+        SessionStep("", "", "", name="first", writes=("monitor.flip_x",)),
+        SessionStep("", "", "", name="second", writes=("monitor.bits", "render.bits")),
+    )
+    plan = SessionPlan(steps, {})
+    assert plan.names == ("first", "second")
+    assert plan.later_keys(0) == {"monitor.bits", "render.bits"}
+    assert plan.later_keys(1) == frozenset()
+
+
+def test_a_camera_is_told_with_the_monitor_that_it_sees():
+    camera = ClosedCamera()
+    assert origin_of(camera) == "closed camera"
+    camera.monitor = MonitorIdentity(maker="DEL", connector="HDMI-1")
+    assert origin_of(camera) == "closed camera"
+    camera.monitor = MonitorIdentity(maker="DEL", connector="HDMI-1", edid_sha256="ab12")
+    assert origin_of(camera) == f"closed camera on {camera.monitor.name()}"
 
 
 @pytest.mark.parametrize("number", range(len(STEPS)), ids=[step.name for step in STEPS])
@@ -38,45 +85,48 @@ def test_a_step_depends_on_its_tables_but_for_what_later_steps_set(tmp_path, num
         for key in step.writes:
             table, name = key.split(".")
             tables[table][name] = 1
-    before = state_of(tmp_path, number, tables)
-    later = [key for step in STEPS[number + 1 :] for key in step.writes]
+    later = FIRST_LIGHT.later_keys(number)
+    before = state_sha256(STEPS[number], later, tables, tmp_path, "a camera")
     for table, keys in tables.items():
         for name in keys:
             changed = tables | {table: keys | {name: 2}}
             is_read = table in STEPS[number].tables and f"{table}.{name}" not in later
-            assert (state_of(tmp_path, number, changed) != before) == is_read
-    monitor = SimpleNamespace(edid_sha256="ab12", name=lambda: "a monitor")
-    is_shown = bool(STEPS[number].tables)
-    assert (state_of(tmp_path, number, tables, monitor) != before) == is_shown
+            after = state_sha256(STEPS[number], later, changed, tmp_path, "a camera")
+            assert (after != before) == is_read
+    by_another = state_sha256(STEPS[number], later, tables, tmp_path, "another")
+    assert (by_another != before) == bool(STEPS[number].tables)
 
 
-def test_an_attempt_with_another_number_of_patches_begins_anew():
-    def attempt(state: str, patches: int) -> str:
-        session = SimpleNamespace(_state=lambda number, tables: state, patches=patches)
-        return FirstLightSession._attempt(session, 0)
+def test_an_attempt_on_another_bench_or_with_another_number_of_patches_begins_anew(tmp_path):
+    longer = {"collimator": {"focal_length_mm": 41}}
+    attempts = []
+    for patches, changes in ((5, {}), (5, {}), (6, {}), (5, longer)):
+        attempts.append(session_of(tmp_path, patches, changes)._attempt(0))
+    first, again, *others = attempts
+    assert first == again
+    assert len({first, *others}) == 3
 
-    assert attempt("state", 5) == attempt("state", 5)
-    assert len({attempt("state", 5), attempt("state", 6), attempt("other", 5)}) == 3
+
+@pytest.mark.parametrize("step", STEPS, ids=[step.name for step in STEPS])
+def test_a_step_that_was_skipped_runs_again_where_what_it_lacked_may_be_there(tmp_path, step):
+    number = STEPS.index(step)
+    session = session_of(tmp_path)
+    session.records = {name: record(name, "done") for name in step.needs}
+    state = session._state(number)
+    for verdict, is_done in (("done", True), ("skipped", not step.needs), ("failed", False)):
+        session.records[step.name] = record(step.name, verdict, state)
+        assert session._is_done(number) == is_done
+        session.records[step.name] = record(step.name, verdict, "other")
+        assert not session._is_done(number)
 
 
 def test_figures_are_known_of_steps_that_are_done(tmp_path):
-    records = {}
+    session = session_of(tmp_path)
     for verdict in ("done", "failed", "skipped"):
-        records[verdict] = SimpleNamespace(verdict=verdict, figures={"figure": 1.0})
-    session = SimpleNamespace(
-        folder=tmp_path,
-        records=records,
-        file=None,
-        source=None,
-        patches=0,
-        _shows=None,
-        _progress=SimpleNamespace(stage=None),
-        _watched_s=0.0,
-        _frames=1,
-    )
-    context = FirstLightSession._context(session, STEPS[0], goes_on=False)
+        session.records[verdict] = record(verdict, verdict, figure=1.0)
+    context = session._context(STEPS[0], goes_on=False)
     assert context.known == {"done.figure": 1.0}
-    assert context.folder == tmp_path / "images" / f"{STEPS[0].name}-1"
+    assert context.folder == tmp_path / "s" / "images" / f"{STEPS[0].name}-1"
 
 
 def test_the_newest_image_may_be_incomplete(tmp_path):
@@ -103,52 +153,21 @@ def test_only_what_was_done_fails_by_a_figure_at_an_end(verdict):
     assert StepOutcome(verdict, "measured", fitted=(inside,)).checked().verdict == verdict
 
 
-@pytest.mark.parametrize(("peak_dn", "is_bright"), [(810, True), (790, False)])
-def test_an_image_is_too_bright_by_what_the_adc_reads(peak_dn, is_bright):
-    """Over 0.8 of 1000 DN, of which 300 are dark."""
-    looked = SimpleNamespace(raw_peak=peak_dn, floor_dn=300)
-    assert StepContext.is_too_bright(SimpleNamespace(full_dn=1000), looked) == is_bright
+@pytest.mark.parametrize(("peak", "is_bright"), [(0.81, True), (0.79, False)])
+def test_an_image_is_too_bright_by_what_the_adc_reads(tmp_path, peak, is_bright):
+    """Over 0.8 of its range, of which 0.3 are dark."""
+    context = closed_context(tmp_path, ClosedCamera())
+    image = np.zeros(DETECTOR_PX[::-1])
+    looked = DarkSubtracted(tmp_path / "a.png", image, peak * FULL_DN, 0.3 * FULL_DN)
+    assert context.is_too_bright(looked) == is_bright
 
 
 def test_a_square_s_rows_and_columns_hold_its_margins():
     """A screen of which the tracker sees two pixels in one, 10 px right and 5 px down."""
-    geometry = SimpleNamespace(
-        to_tracker=lambda x, y: (x / 2 + 10, y / 2 + 5),
-        tracker=SimpleNamespace(resolution_px=(44, 60)),
-    )
+    monitor = Camera((100, 100), 1600.0, (0.0, 0.0), np.eye(3))
+    geometry = BenchGeometry(monitor, Camera((44, 60), 800.0, (10.0, 5.0), np.eye(3)))
     # columns 20 to 60 are seen at 20 to 40, rows 30 to 70 at 20 to 40
     rows, columns = _seen(geometry, (20, 30), 41, 3.0)
     assert (rows, columns) == (slice(17, 44), slice(17, 44))
     assert "not whole" in refusal(_seen, geometry, (20, 30), 41, 3.1)
     assert "not whole" in refusal(_seen, geometry, (-20, 30), 41, 3.0)
-
-
-def test_each_primary_s_lit_pixels_are_drawn_in_its_own_light():
-    class Masks(dict):
-        """Images by key, scaled."""
-
-        def keep(self, key, image):
-            self[key] = image
-
-        def image(self, key, brightest):
-            return brightest * self[key]
-
-    drawn = []
-
-    def draw(light, primary):
-        drawn.append(primary)
-        return np.full((2, 2), primary)
-
-    bench = SimpleNamespace(
-        _primaries_seen=[3.0, 5.0],
-        _masks=Masks(),
-        _drawn=draw,
-        _glow_e_per_s=np.zeros((2, 2)),
-    )
-    place = np.array([4, 7])
-    for brightness in (1.0, 2.0):
-        light = SimpleNamespace(e_per_s=np.full(2, brightness), place=place)
-        for number, primary in enumerate((3.0, 5.0)):
-            image = VirtualBench._primary_image(bench, light, number)
-            assert image.tolist() == [[primary * brightness] * 2] * 2
-    assert drawn == [3.0, 5.0]

@@ -8,7 +8,6 @@ import logging
 import math
 import os
 import time
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,8 +15,8 @@ import pytest
 from hilstar.display.calibration import with_uniformity
 from hilstar.display.quantise import LitLight
 from hilstar.instruments.calibrate.first_light.image_sources import (
+    BlackImages,
     ByHand,
-    GrabCamera,
     MaskImages,
     Pattern,
     PatternFrames,
@@ -45,6 +44,7 @@ from tests.support.closed_camera import (
     power_of,
 )
 from tests.support.refusals import refusal
+from tests.support.spectra import bump, write_channels, write_panel
 
 WHITE_E_PER_S = float(CLOSED["render"]["flux_at_white_e_per_s"])
 WHITE = 2**BITS - 1
@@ -406,23 +406,42 @@ def test_a_person_may_press_a_key_that_has_a_meaning(tmp_path, caplog):
     assert found == tmp_path / "figure.png"
 
 
-def test_each_primary_s_light_is_relative_to_white_of_all_of_them():
-    """Whites of 20, 50 and 30 e-/s, of 100 together."""
-    signal = np.linspace(0, 1, 4)
-    whites = (20.0, 50.0, 30.0)
-    primaries = []
-    for power, white in zip((1.0, 2.0, 3.0), whites, strict=True):
-        response = SimpleNamespace(light=signal**power)
-        primaries.append(SimpleNamespace(response=response, flux_at_white_e_per_s=white))
-    made = object.__new__(VirtualBench)
-    made._panel = SimpleNamespace(primaries=primaries, flux_at_white_e_per_s=100.0)
-    made._primaries_seen = (None,) * 3
+@pytest.fixture
+def apart(sources, tmp_path) -> VirtualBench:
+    """A bench whose primaries are lit apart, in stripes of their own."""
+    nm = np.arange(400.0, 701.0, 10.0)
+    write_panel(tmp_path / "panel.csv", [bump(middle, 30, nm) for middle in (620, 540, 460)], nm)
+    keys = write_channels(tmp_path, nm, {name: np.full_like(nm, 0.5) for name in "rgb"})
+    primaries = {"file": "panel.csv", "layout": "rgb-stripe"}
+    bench = {"tracker": keys, "monitor.primaries": primaries, "render": {"colour": "star"}}
+    return sources(bench, filed=(bench,))
+
+
+def test_each_primary_s_light_is_relative_to_white_of_all_of_them(apart):
+    """Of a spectrum that a tracker sees as even, by its photons."""
+    whites = np.array([620.0, 540.0, 460.0])
+    shares = whites / whites.sum()
     place = np.array([5, 9])
-    lights = made._lights(place, np.array([[3, 1, 2], [0, 3, 1]]))
-    wanted = [[0.2, 0.0], [0.5 / 9, 0.5], [0.3 * 8 / 27, 0.3 / 27]]
-    for light, e_per_s in zip(lights, wanted, strict=True):
+    codes = np.array([[WHITE, 100, 200], [0, WHITE, 100]])
+    lights = apart._lights(place, codes)
+    for number, light in enumerate(lights):
         assert light.place.tolist() == [5, 9]
-        assert light.e_per_s.tolist() == pytest.approx(e_per_s)
+        # the spectra end at 400 and 700 nm, where the outer bumps are not over
+        wanted = shares[number] * LIGHT[codes[:, number]]
+        assert light.e_per_s == pytest.approx(wanted, rel=5e-3)
+
+
+def test_each_primary_s_lit_pixels_are_drawn_in_its_own_light(apart):
+    """Of one level they are drawn once and scaled for others."""
+    place = np.array([4000, 7000])
+    stripes = set()
+    for number, primary in enumerate(apart._primaries_seen):
+        drawn = apart._drawn(LitLight(place, np.ones(2)), primary)
+        stripes.add(primary.place_px)
+        for brightness in (1.0, 2.0):
+            image = apart._primary_image(LitLight(place, np.full(2, brightness)), number)
+            np.testing.assert_allclose(image, brightness * drawn, rtol=1e-5, atol=1e-3)
+    assert len(stripes) == 3
 
 
 class Watchers:
@@ -438,11 +457,10 @@ class Watchers:
         self.frames.append(frame)
 
 
-def test_patterns_are_handed_on_one_after_another_where_somebody_watches():
+def test_patterns_are_handed_on_one_after_another_where_somebody_watches(tmp_path):
     watchers = Watchers()
     frames = PatternFrames(watchers)
-    monitor = SimpleNamespace(bits=BITS)
-    file = SimpleNamespace(config=SimpleNamespace(monitor=monitor), sha256="5" * 64)
+    file = bench(tmp_path, "filed")
     grey = np.zeros((3, 5), dtype=np.uint16)
     grey[1, 2] = 700
     colour = np.zeros((3, 5, 3), dtype=np.uint16)
@@ -455,18 +473,16 @@ def test_patterns_are_handed_on_one_after_another_where_somebody_watches():
         head = frame.head
         assert (head.frame, head.lit_ns, head.channels) == (number, lit_ns, channels)
         assert (head.width, head.height, head.bits) == (5, 3, BITS)
-        assert head.bench_sha256 == "5" * 64
+        assert head.bench_sha256 == file.sha256
     assert (first.lit.tolist(), first.codes.tolist()) == ([7], [700])
     assert (second.lit.tolist(), second.codes.tolist()) == ([14], [[1, 2, 3]])
 
 
 def test_a_camera_s_black_images_are_said_once_of_lit_patterns_and_once_of_black_ones(caplog):
-    camera = object.__new__(GrabCamera)
-    camera._told_black = set()
-    black = SimpleNamespace(dn=np.zeros((2, 3), dtype=np.uint16))
-    grey = SimpleNamespace(dn=np.eye(2, 3, dtype=np.uint16))
+    images = BlackImages()
+    black, grey = np.zeros((2, 3), dtype=np.uint16), np.eye(2, 3, dtype=np.uint16)
     for image, is_lit in ((grey, True), (black, True), (black, True), (black, False)):
-        camera._tell_black(image, "frame_0", lit=is_lit)
+        images.tell(image, "frame_0", lit=is_lit)
     lens_cap, black_level = caplog.messages
     assert lens_cap.startswith("frame_0: every pixel is 0; look at the lens cap")
     assert "a black level above 0" in black_level

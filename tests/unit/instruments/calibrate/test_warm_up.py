@@ -3,7 +3,6 @@ the stated errors hold.
 """
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +16,7 @@ from hilstar.instruments.calibrate.warm_up import (
     judge_warm_up,
     watch_white,
 )
+from hilstar.server.bench.config.certify import VirtualSettings
 from tests.support.fake_clock import FakeClock
 
 CHANGE, TAU_S = 0.04, 200.0
@@ -197,11 +197,10 @@ def test_a_planted_warm_up_is_stable_by_its_size_and_never_before_the_watch(
     cold_percent, ended_s, last_s
 ):
     """`ended_s` of the monitor's time are `last_s` of the watch's."""
-    virtual = SimpleNamespace(
+    virtual = VirtualSettings(
         warm_up_min=TAU_S / 60, cold_percent=cold_percent, drift_percent_per_h=0.0
     )
-    truth = SimpleNamespace(config=SimpleNamespace(certify=SimpleNamespace(virtual=virtual)))
-    planted = _warm_up_truth(truth, SimpleNamespace(limit=STABLE), ended_s, last_s)
+    planted = _warm_up_truth(virtual, STABLE, ended_s, last_s)
     stable_s = STABLE_S - (ended_s - last_s)
     if ended_s > STABLE_S:
         stable_s = 0.0

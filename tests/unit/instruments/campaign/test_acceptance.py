@@ -396,7 +396,7 @@ def test_a_plan_with_other_cases_does_not_go_on(tmp_path: Path) -> None:
 
 
 def test_a_plan_s_time_is_that_of_its_cases_on_their_workers_and_of_what_opens_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
     """A case takes 3 s at a sweep's start, 6 s in its middle and 9 s at its end, and a session 1 s;
     nine levels of 8 cases on 4 workers take 9 (8 x 6 / 4 + 1) s.
@@ -414,8 +414,7 @@ def test_a_plan_s_time_is_that_of_its_cases_on_their_workers_and_of_what_opens_t
     checked = read_acceptance_plan(plan, bench, False, None)
     made = Acceptance(checked, bench, tmp_path / "out", "centroids", 10.0)
     at_s = iter([(2.0, 5.0), (3.0, 0.5), (6.0, 1.0), (9.0, 1.5)])
-    monkeypatch.setattr(acceptance, "_case_s", lambda campaign: next(at_s))
-    field, sweep = made.costs(4)
+    field, sweep = made.costs(4, lambda campaign: next(at_s))
     assert (field.case_set.name, field.cases) == ("field", 60)
     assert field.seconds == pytest.approx(60 * 2 / 4 + 5, abs=5)
     levels = 2 + 7
@@ -423,7 +422,7 @@ def test_a_plan_s_time_is_that_of_its_cases_on_their_workers_and_of_what_opens_t
     assert sweep.seconds == pytest.approx(levels * (8 * 6 / 4 + 1), abs=10)
     # of more workers than cases some have nothing to do
     at_s = iter([(2000.0, 500.0), (3e3, 0.0), (3e3, 0.0), (3e3, 0.0)])
-    field, sweep = made.costs(100)
+    field, sweep = made.costs(100, lambda campaign: next(at_s))
     assert field.seconds == pytest.approx(2500, abs=5)
     assert sweep.seconds == pytest.approx(levels * 3e3, abs=45)
     made.sets = tuple(replace(case_set, refused="no GPU") for case_set in made.sets)

@@ -5,7 +5,6 @@ and why, and failures over all levels of a sweep. No case is run.
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from hilstar.instruments.campaign.case_table import Columns
 from hilstar.instruments.campaign.requirements import MET, NOT_MET, NOT_SHOWN
 from hilstar.instruments.campaign.run import Campaign
 from hilstar.instruments.campaign.store import Directory
+from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.acceptance import write_bench
 from tests.support.planted_answers import answers
 
@@ -98,9 +98,11 @@ def test_stamps_of_an_own_clock_or_of_arrivals_tell_no_time_of_measurement(
     tmp_path: Path, clock: str | None, stamp: str | None, tells: bool
 ) -> None:
     acceptance = acceptance_of(tmp_path, LOST + clause("time-bias", "maximum = 1.0"))
-    answer_keys = None if clock is None else SimpleNamespace(clock=clock, stamp=stamp)
-    config = SimpleNamespace(answers=answer_keys, tracker=acceptance.file.config.tracker)
-    acceptance.file = SimpleNamespace(config=config)  # type: ignore[assignment]
+    tables = {}
+    if clock is not None:
+        udp = {"source": "udp", "bind": "127.0.0.1:9", "format": "json"}
+        tables["answers"] = udp | {"clock": clock, "stamp": stamp}
+    acceptance.file = read_bench_file(write_bench(tmp_path, **tables))
     acceptance.on_bench = True
     (case_set,) = acceptance.sets
     cases = answers(np.random.default_rng(4))

@@ -250,17 +250,21 @@ def test_a_log_s_convention_and_mounting_are_the_bench_files(tmp_path: Path) -> 
     ).magnitude() < 1e-12
 
 
+def maker_of(folder: Path, *vary: dict[str, Any], **keys: Any) -> CaseMaker:
+    path = write_campaign(folder, *vary, **keys)
+    file = read_bench_file(folder / "bench.toml")
+    return CaseMaker(parse_plan(path, path.read_text()), file, folder)
+
+
 def bodied(folder: Path, **keys: Any) -> CaseMaker:
     """The cases of a plan that looks 30 degrees from the Sun."""
-    plan = write_campaign(
+    return maker_of(
         folder,
         {"key": "sky.epoch_utc", "values": ["2026-03-20T12:00:00"]},
         {"key": "sky.bodies.sun", "values": [True]},
         {"key": "body_deg", "values": [30.0]},
         attitudes={"kind": "body", "body": "sun"} | keys,
     )
-    file = read_bench_file(folder / "bench.toml")
-    return CaseMaker(parse_plan(plan, plan.read_text()), file, folder)
 
 
 def test_a_case_beside_a_body_looks_at_its_angle_from_where_astropy_has_it(tmp_path: Path) -> None:
@@ -282,7 +286,7 @@ def test_a_case_beside_the_earth_looks_at_its_angle_from_the_limb(
     tmp_path: Path, limb_deg: float
 ) -> None:
     tle = ROOT / "configs" / "plans" / "low-orbit.tle"
-    plan = write_campaign(
+    maker = maker_of(
         tmp_path,
         {"key": "sky.epoch_utc", "values": ["2026-03-20T12:00:00"]},
         {"key": "spacecraft.orbit", "values": [str(tle)]},
@@ -291,8 +295,6 @@ def test_a_case_beside_the_earth_looks_at_its_angle_from_the_limb(
         {"key": "time_s", "values": [600.0]},
         attitudes={"kind": "body", "body": "earth"},
     )
-    file = read_bench_file(tmp_path / "bench.toml")
-    maker = CaseMaker(parse_plan(plan, plan.read_text()), file, tmp_path)
     utc_ns = int(np.datetime64("2026-03-20T12:10:00", "ns").astype(np.int64))
     place_km, _ = TleOrbit(tle.read_text(), "low-orbit.tle").state(utc_ns)
     radius_deg = np.degrees(np.arcsin(EQUATOR_KM / np.linalg.norm(place_km)))
@@ -306,14 +308,12 @@ def test_a_case_beside_the_earth_looks_at_its_angle_from_the_limb(
 
 
 def test_a_case_that_speeds_up_turns_as_its_rate_says(tmp_path: Path) -> None:
-    plan = write_campaign(
+    maker = maker_of(
         tmp_path,
         {"key": "rate_deg_s.x", "values": [0.5]},
         {"key": "acceleration_deg_s2.x", "values": [0.2]},
         {"key": "acceleration_deg_s2.y", "values": [-0.1]},
     )
-    file = read_bench_file(tmp_path / "bench.toml")
-    maker = CaseMaker(parse_plan(plan, plan.read_text()), file, tmp_path)
     case = maker.case(0, np.full(6, 0.3))
     later = maker.after(case, 2_000_000_000)
     rate = np.radians([0.5 + 0.4, -0.2, 0.0])
@@ -406,12 +406,6 @@ def test_a_position_angle_is_from_north_to_east(position_angle_deg, radec) -> No
     assert np.degrees(np.arccos(to_matrix(q)[2] @ wanted[2])) < 0.04
     back = to_matrix(beside_q(middle, 0.0, 1.0, 30.0))
     assert back == pytest.approx(to_matrix(from_radec_roll_deg(84.0, -2.0, 30.0)), abs=1e-9)
-
-
-def maker_of(folder: Path, *vary: dict[str, Any], **keys: Any) -> CaseMaker:
-    path = write_campaign(folder, *vary, **keys)
-    file = read_bench_file(folder / "bench.toml")
-    return CaseMaker(parse_plan(path, path.read_text()), file, folder)
 
 
 def test_a_case_that_begins_at_a_log_s_end_stays_there(tmp_path: Path) -> None:

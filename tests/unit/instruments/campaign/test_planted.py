@@ -28,6 +28,8 @@ from hilstar.instruments.campaign.planted import (
     lit_stars,
 )
 from hilstar.instruments.campaign.solver_answer import SolverAnswer
+from hilstar.instruments.simulate.simulator import Exposure
+from hilstar.optics.layers.view import View
 from hilstar.server.answers.answer import ReportedStar
 
 START_Q = from_radec_roll_deg(84.0, -1.2, 30.0)
@@ -39,13 +41,11 @@ TRUTH = [
 ]  # fmt: skip
 
 
-def exposure(truth: Any = (), faults: Any = (), rate_rad_s: Any = RATE_RAD_S) -> Any:
+def exposure(truth: Any = (), faults: Any = (), rate_rad_s: Any = RATE_RAD_S) -> Exposure:
     """An exposure of a detector of 300 by 200 px."""
-    view = SimpleNamespace(
-        exposure_s=EXPOSURE_S, turn=SimpleNamespace(rate_cam_rad_s=np.array(rate_rad_s))
-    )
-    rows = np.array(list(truth), dtype=TRUTH)
-    return SimpleNamespace(view=view, truth=rows, faults=faults, dn=np.zeros((200, 300)))
+    view = View.exposure(START_Q, np.array(rate_rad_s), EXPOSURE_S)
+    dn = np.zeros((200, 300), dtype=np.uint16)
+    return Exposure(view, dn, np.zeros(dn.shape), np.array(list(truth), dtype=TRUTH), 0, faults)
 
 
 def tracker(with_rate: bool = False, conditions: Any = None, **planted: Any) -> CaseTracker:
@@ -257,5 +257,5 @@ def test_a_case_s_time_is_that_of_the_first_two_after_one_that_warms_up(monkeypa
     monkeypatch.setattr(acceptance, "time", SimpleNamespace(perf_counter=lambda: now_s))
     design = SimpleNamespace(points=lambda begin, end: [f"point {k}" for k in range(begin, end)])
     campaign: Any = SimpleNamespace(cases=60, design=design, job="job")
-    assert acceptance._case_s(campaign) == (2.0, 5.0)
+    assert acceptance.first_cases_s(campaign) == (2.0, 5.0)
     assert Slow.closed

@@ -9,7 +9,6 @@ import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -32,8 +31,8 @@ from hilstar.instruments.campaign.solvers import (
 from hilstar.instruments.campaign.tally import attitude_error_arcsec
 from hilstar.instruments.simulate.simulator import Exposure, Simulator
 from hilstar.server.answers.answer import ReportedStar
-from hilstar.server.bench.bench_file import read_bench_file
-from tests.support.benches import ROOT
+from hilstar.server.bench.bench_file import bench_file_of, read_bench_file
+from tests.support.benches import ROOT, bench_text
 from tests.support.campaigns import write_campaign
 from tests.support.refusals import refusal
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -234,16 +233,17 @@ def test_a_quaternion_is_a_unit_one_but_for_its_decimals(norm: float, is_taken: 
 
 def test_a_solver_is_told_the_field_along_the_image_s_width() -> None:
     """1200 by 700 px of 13 um behind 65 mm: 5000 px, and twice the arc tangent of 600 of them."""
-    settings = SimpleNamespace(
-        resolution_px=(1200, 700),
-        focal_length_mm=65.0,
-        pixel_pitch_um=13.0,
-        principal_point_px=None,
-        exposure_s=0.2,
-    )
-    config = SimpleNamespace(tracker=settings, sky=SimpleNamespace(epoch_jyear=2026.5))
-    canvas = SimpleNamespace(psf=SimpleNamespace(width_px=(0.7, 0.8)))
-    facts = tracker_facts(SimpleNamespace(config=config, canvas=canvas))  # type: ignore[arg-type]
+    tables = {
+        "tracker": {
+            "resolution_px": [1200, 700],
+            "focal_length_mm": 65.0,
+            "exposure_s": 0.2,
+            "psf_sigma_px": [0.7, 0.8],
+        },
+        "sky": {"epoch_jyear": 2026.5, "faintest_v_mag": 1.0},
+    }
+    with Simulator(bench_file_of(Path("bench.toml"), bench_text(tables))) as simulator:
+        facts = tracker_facts(simulator)
     assert facts == {
         "resolution_px": (1200, 700),
         "focal_length_px": pytest.approx(5000.0),

@@ -5,7 +5,6 @@ stamps, faults and stars all differ.
 from __future__ import annotations
 
 import hashlib
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,10 @@ from hilstar.basics.rotation import from_radec_roll_deg, from_rotation_vector, m
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.instruments.campaign.solver_answer import CentroidErrors, SolverAnswer
 from hilstar.instruments.campaign.tally import CaseTally
+from hilstar.instruments.simulate.simulator import Exposure
 from hilstar.optics.frame_motion import CameraTurn
+from hilstar.optics.layers.truth import TRUTH_DTYPE
+from hilstar.optics.layers.view import View
 
 START_Q = from_radec_roll_deg(84.0, -1.2, 30.0)
 RATE_RAD_S = np.radians([0.4, -0.3, 1.0])
@@ -26,11 +28,11 @@ def turn_at(seconds: float) -> CameraTurn:
     return CameraTurn(propagate(START_Q, RATE_RAD_S, seconds), RATE_RAD_S)
 
 
-def exposure(number: int) -> Any:
+def exposure(number: int) -> Exposure:
     """An exposure of four by three pixels, with two stars more than its number."""
-    view = SimpleNamespace(exposure_s=EXPOSURE_S)
+    view = View.exposure(START_Q, np.zeros(3), EXPOSURE_S)
     dn = np.full((3, 4), number, dtype=np.uint16)
-    return SimpleNamespace(view=view, dn=dn, truth=np.zeros(2 + number))
+    return Exposure(view, dn, np.zeros((3, 4)), np.zeros(2 + number, dtype=TRUTH_DTYPE))
 
 
 def answered(at_s: float, error_arcsec: tuple[float, float, float], stamp_s: float = 0.0) -> Any:

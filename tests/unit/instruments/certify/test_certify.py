@@ -35,7 +35,6 @@ from hilstar.server.record.ledger_records import read_head
 from tests.support.benches import bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.planted_certify import (
-    BENCH,
     LIGHT,
     PARTS,
     PLACE,
@@ -44,11 +43,11 @@ from tests.support.planted_certify import (
     coverage_by_images,
     drawn,
     plant,
+    stated_bench,
     stated_lens,
 )
 from tests.support.planted_readings import (
     ARCSEC,
-    DELAY_MS,
     KINDS,
     WHITE_E_PER_S,
     PlantedReader,
@@ -185,18 +184,9 @@ def test_structure_is_found_where_it_is_and_not_where_it_is_not() -> None:
 IN_PHASE = (29, 66, 72, 85)
 
 
-def plain_bench(folder: Path) -> BenchFile:
-    """A bench of an sRGB monitor and a lens without errors."""
-    path = folder / "bench.toml"
-    path.write_text(
-        BENCH.format(calibration="srgb", delay_ms=DELAY_MS, geometry="", white=WHITE_E_PER_S)
-    )
-    return read_bench_file(path)
-
-
 @pytest.mark.parametrize("number", IN_PHASE)
-def test_waves_of_the_trackers_pixels_do_not_fit_the_noise_of_dots(tmp_path, number: int) -> None:
-    file = plain_bench(tmp_path)
+def test_waves_of_the_trackers_pixels_do_not_fit_the_noise_of_dots(number: int) -> None:
+    file = stated_bench()
     one = supposed(np.random.default_rng((32, number)))
     x_px, y_px = dot_places(geometry_of(file))
     dots = PlantedReader(one, np.random.default_rng((32, number, 2))).dots(x_px, y_px, DOT_IMAGES)
@@ -272,11 +262,11 @@ def test_a_screen_is_the_same_however_its_mounting_is_stated(tmp_path) -> None:
         VirtualReader(file, read_bench_file(mirrored), 3)
 
 
-def test_a_reading_of_a_lattice_with_few_dots_weighs_by_its_own_noise(tmp_path) -> None:
+def test_a_reading_of_a_lattice_with_few_dots_weighs_by_its_own_noise() -> None:
     """White of a sparse lattice is ten times as noisy as other codes: its interval is its own,
     and theirs are not wider.
     """
-    file = plain_bench(tmp_path)
+    file = stated_bench()
     codes = np.array([*[0, 255, 40, 80, 120, 160, 200] * 3, 0])
     shape = np.where(codes == 255, 10.0, 1.0)
     rng = np.random.default_rng(4)
@@ -289,11 +279,11 @@ def test_a_reading_of_a_lattice_with_few_dots_weighs_by_its_own_noise(tmp_path) 
     assert 5 < sigma[-1] / np.median(sigma[:-1]) < 20
 
 
-def test_a_faint_code_that_reads_below_black_does_not_undo_the_others(tmp_path) -> None:
+def test_a_faint_code_that_reads_below_black_does_not_undo_the_others() -> None:
     """Its light, and so its noise by its light, was 0, and all scatters became infinite: "white
     reads no light above black".
     """
-    file = plain_bench(tmp_path)
+    file = stated_bench()
     lit = [1, 20, 40, 80, 120, 160, 200, 255]
     codes = np.array([0, *lit, 0, *lit, 0, *lit, 0])
     rng = np.random.default_rng(4)
@@ -325,8 +315,8 @@ def twice_read(file: BenchFile) -> FloatArray:
     return light
 
 
-def test_of_two_readings_of_a_faint_code_the_darker_counts_as_much(tmp_path) -> None:
-    file = plain_bench(tmp_path)
+def test_of_two_readings_of_a_faint_code_the_darker_counts_as_much() -> None:
+    file = stated_bench()
     light, faint = twice_read(file), LIT_TWICE == 1
     true = float(light[faint][0]) - 1e3
     light[faint] += true / 2 * np.array([1, -1])
@@ -336,9 +326,9 @@ def test_of_two_readings_of_a_faint_code_the_darker_counts_as_much(tmp_path) -> 
     assert deviation.value[0] == pytest.approx(1, abs=1e-4)
 
 
-def test_what_readings_share_is_no_larger_where_a_faint_code_reads_nothing(tmp_path) -> None:
+def test_what_readings_share_is_no_larger_where_a_faint_code_reads_nothing() -> None:
     """Relative to a reading of no light it was a billion times too large, and so all intervals."""
-    file = plain_bench(tmp_path)
+    file = stated_bench()
     light = twice_read(file)
     light[LIT_TWICE == 1] = [999.0, 1001.0]
     shared_e_per_s = np.where(LIT_TWICE == 0, 0.0, 2.0)[:, None]

@@ -5,9 +5,9 @@ a lens's terms, and the correlation of what a fit leaves.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,10 +16,13 @@ from scipy.interpolate import CubicSpline
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.display.calibration import CalibrationHead, NotesTable, write_calibration
+from hilstar.display.geometry import ErrorTable, MadeTable, Notes, monitor_camera, write_geometry
 from hilstar.display.identity import MonitorIdentity
 from hilstar.instruments.calibrate.geometric import fit as fits
-from hilstar.instruments.certify import certificate, estimates, lens
-from hilstar.instruments.certify.bench_readings import LightReadings
+from hilstar.instruments.certify import estimates, lens
+from hilstar.instruments.certify.assembly import Assembled
+from hilstar.instruments.certify.bench_readings import DotReadings, LightReadings
 from hilstar.instruments.certify.budget import BudgetTrials, Combined, Input
 from hilstar.instruments.certify.certificate import (
     _contributions,
@@ -39,6 +42,7 @@ from hilstar.instruments.certify.estimates import (
     _LightFit,
     _scatter,
 )
+from hilstar.instruments.certify.model import Figures
 from hilstar.instruments.certify.structure import (
     MIN_CELLS,
     RATIOS,
@@ -52,6 +56,8 @@ from hilstar.instruments.certify.structure import (
     weighed,
 )
 from hilstar.optics.camera import Camera
+from hilstar.server.bench.bench_file import BenchFile, bench_file_of
+from tests.support.planted_certify import BENCH, reference_star, stated_bench
 
 SIZE_PX = (1920, 1080)
 ROUNDING = 1e-9
@@ -62,23 +68,19 @@ def budget_input(name: str, dof: float = math.inf) -> Input:
     return Input(name, "normal", "stated", 1, 0.25, "mag", dof)
 
 
-def certified(decision: str, delay_ms: float = 0.0, **limits):
-    """The settings of [certify] and a panel's stated delay, as a figure's verdict asks for them."""
-    none = dict.fromkeys(
-        ("max_flux_mag", "max_place_arcsec", "max_attitude_arcsec", "max_roll_arcsec")
-    )
-    certify = SimpleNamespace(**{**none, "max_latency_ms": None, **limits}, decision=decision)
-    monitor = SimpleNamespace(panel_delay_ms=delay_ms)
-    return SimpleNamespace(config=SimpleNamespace(certify=certify, monitor=monitor))
+def deciding(decision: str, **limits: float) -> BenchFile:
+    """A bench whose panel has a delay of 8 ms, with a rule of decision and limits."""
+    lines = [f"{name} = {limit}\n" for name, limit in limits.items()]
+    return stated_bench(f'[certify]\ndecision = "{decision}"\n{"".join(lines)}')
 
 
 @pytest.mark.parametrize(
     ("decision", "value", "interval", "conforms"),
     [
-        ("guarded", 0.0, (-0.09, 0.09), True),
-        ("guarded", 0.0, (-0.11, 0.09), False),
-        ("guarded", 0.0, (-0.09, 0.11), False),
-        ("guarded", 0.2, (0.11, 0.3), False),
+        ("guard-band", 0.0, (-0.09, 0.09), True),
+        ("guard-band", 0.0, (-0.11, 0.09), False),
+        ("guard-band", 0.0, (-0.09, 0.11), False),
+        ("guard-band", 0.2, (0.11, 0.3), False),
         ("simple", 0.09, (-0.3, 0.3), True),
         ("simple", -0.11, (-0.11, 0.0), False),
     ],
@@ -86,15 +88,13 @@ def certified(decision: str, delay_ms: float = 0.0, **limits):
 def test_a_figure_conforms_where_all_of_its_interval_or_its_value_alone_does(
     decision, value, interval, conforms
 ):
-    file = certified(decision, max_flux_mag=0.1)
+    file = deciding(decision, max_flux_mag=0.1)
     assert _judged(file, "flux", value, interval) == (0.1, conforms)
     assert _judged(file, "attitude_z", value, interval) == (None, None)
 
 
 def test_a_latency_s_limit_is_about_the_stated_delay_and_a_roll_has_its_own():
-    file = certified(
-        "guarded", 8.0, max_latency_ms=1.0, max_attitude_arcsec=2.0, max_roll_arcsec=30.0
-    )
+    file = deciding("guard-band", max_latency_ms=1.0, max_attitude_arcsec=2.0, max_roll_arcsec=30.0)
     assert _judged(file, "latency", 8.5, (7.1, 8.9)) == (1.0, True)
     assert _judged(file, "latency", 0.0, (-0.5, 0.5)) == (1.0, False)
     assert _judged(file, "attitude_x", 0.0, (-3.0, 3.0)) == (2.0, False)
@@ -117,42 +117,52 @@ def test_an_input_s_freedom_is_written_where_it_is_finite():
 
 
 def test_a_figure_s_field_counts_from_0_and_its_star_has_its_own():
-    star = SimpleNamespace(hip=71, field=2, third=1)
-    budget = SimpleNamespace(figures=SimpleNamespace(stars=[None, star]))
-    assert _place_of(budget, "flux", 1) == (71, 2, "middle third")
-    assert _place_of(budget, "attitude_x", -1) == (None, 0, "field 0")
-    assert _place_of(budget, "attitude_z", -3) == (None, 2, "field 2")
-    assert _place_of(budget, "latency", 0) == (None, None, "screen")
+    stars = [reference_star(), reference_star(hip=71, field=2, third=1)]
+    assert _place_of(stars, "flux", 1) == (71, 2, "middle third")
+    assert _place_of(stars, "attitude_x", -1) == (None, 0, "field 0")
+    assert _place_of(stars, "attitude_z", -3) == (None, 2, "field 2")
+    assert _place_of(stars, "latency", 0) == (None, None, "screen")
 
 
-def test_a_certificate_s_monitor_is_the_one_that_was_read_or_else_of_its_files(monkeypatch):
-    """Of two files the second has an identity."""
-    filed = MonitorIdentity(maker="DEL", serial="filed")
-    origins = [SimpleNamespace(identity=None), SimpleNamespace(identity=filed)]
-    monkeypatch.setattr(certificate, "measured_on", lambda file: iter(origins))
-    monitor = SimpleNamespace(resolution_px=(1920, 1080), refresh_hz=60.0, calibration="srgb")
-    file = SimpleNamespace(config=SimpleNamespace(monitor=monitor))
-    read = MonitorIdentity(maker="DEL", serial="read")
-    facts = {"resolution_px": [1920, 1080], "refresh_hz": 60.0, "calibration": "srgb"}
-    for now, serial in ((read, "read"), (None, "filed")):
-        told = _monitor(file, now)  # type: ignore[arg-type]
-        assert told == facts | {"identity": {"maker": "DEL", "serial": serial}}
-    origins.clear()
-    assert _monitor(file, None)["identity"] == {}  # type: ignore[arg-type]
+def test_a_certificate_s_monitor_is_the_one_that_was_read_or_else_of_its_files(tmp_path: Path):
+    """Of two files the second, the geometry, has an identity."""
+    filed, read = (MonitorIdentity(maker="DEL", serial=serial) for serial in ("filed", "read"))
+    head = CalibrationHead(
+        kind="photometric", bits=8, response="light.csv", who="", when="", instrument="", unit=""
+    )
+    response = {"w": np.linspace(0.0, 1.0, 256)}
+    q = np.array([1.0, 0.0, 0.0, 0.0])
+    write_calibration(tmp_path / "light.toml", head, response, 0.0, NotesTable())
+    screen = monitor_camera(SIZE_PX, 57.65, 350.0, q)
+    for number, identity in enumerate((filed, None)):
+        notes = Notes({}, ErrorTable(), MadeTable(when=""), identity)
+        write_geometry(tmp_path / f"place-{number}.toml", screen, q, notes)
+    facts = {"resolution_px": [1920, 1080], "refresh_hz": 60.0, "calibration": "light.toml"}
+    for number, now, serial in ((0, read, "read"), (0, None, "filed"), (1, None, "")):
+        text = BENCH.format(
+            calibration="light.toml",
+            delay_ms=8.0,
+            geometry=f'geometry = "place-{number}.toml"',
+            white=1e6,
+        )
+        told = _monitor(bench_file_of(tmp_path / "bench.toml", text), now)
+        known = {"maker": "DEL", "serial": serial} if serial else {}
+        assert told == facts | {"identity": known}
 
 
 def test_each_figure_has_its_own_numbers_and_a_truth_where_there_is_one():
     """Three delays, of which the truth of two is known, and the trials of the second differ."""
     names = [("latency", 0, "ms"), ("latency", 0, "ms"), ("latency", 0, "ms")]
-    budget = SimpleNamespace(not_assessed=[], names=names, inputs=[budget_input("a")])
+    file = deciding("guard-band", max_latency_ms=1.6)
+    figures = Figures(file, [reference_star()])
+    budget = Assembled([budget_input("a")], lambda variables: variables[0], names, figures, [])
     value, standard = np.array([8.0, 9.0, 10.0]), np.array([0.5, 0.25, 0.0])
     lower, upper = value - 3 * standard, value + 3 * standard
     freedom = np.array([2.51, 1e6, 7.0])
     combined = Combined(value, standard, freedom, lower, upper, standard[:, None])
     moved = np.array([0.0, 0.5, 0.0])
     drawn = BudgetTrials(value + moved, 1.1 * standard, lower + moved, upper + moved, 9, True)
-    file = certified("guarded", 8.0, max_latency_ms=1.6)
-    found = list(_figures(file, budget, combined, drawn, np.array([8.1, 9.2])))  # type: ignore[arg-type]
+    found = list(_figures(file, budget, combined, drawn, np.array([8.1, 9.2])))
     assert [each.truth for each in found] == [8.1, 9.2, None]
     assert [each.value for each in found] == [8.0, 9.0, 10.0]
     assert [each.k for each in found] == [3.0, 3.0, 0.0]
@@ -161,8 +171,8 @@ def test_each_figure_has_its_own_numbers_and_a_truth_where_there_is_one():
     assert [each.conforms for each in found] == [True, False, False]
     assert [bool(each.by_trials.differs) for each in found] == [False, True, False]
     assert found[1].by_trials.standard_uncertainty == pytest.approx(0.275)
-    unknown = SimpleNamespace(**vars(budget) | {"not_assessed": ["latency: no photodiode"]})
-    assert list(_figures(file, unknown, combined, drawn, None)) == []  # type: ignore[arg-type]
+    unknown = replace(budget, not_assessed=["latency: no photodiode"])
+    assert list(_figures(file, unknown, combined, drawn, None)) == []
 
 
 def deviation(value: np.ndarray, sigma: float = 1e-6) -> LightDeviation:
@@ -418,14 +428,14 @@ def test_a_tilted_screen_s_terms_are_scales_lean_and_a_perspective_s_second_orde
 def test_a_dot_is_wild_along_either_axis_and_not_by_what_is_smooth(rng):
     """Of errors of 0.1 arcsec about a cubic of 5."""
     x_px, y_px = (rng.uniform(0, side, 400) for side in SIZE_PX)
-    read = SimpleNamespace(x_px=x_px, y_px=y_px)
+    read = DotReadings(x_px, y_px, x_px, y_px, np.ones(400))
     u = x_px / 960 - 1
     residual = np.stack([5 * u**3, np.zeros(400)], axis=1) + 0.1 * rng.standard_normal((400, 2))
     residual[17, 0] += 5.0
     residual[41, 1] -= 5.0
     usable = np.ones(400, dtype=bool)
     usable[3] = False
-    tame = lens._tame(read, residual, usable, SIZE_PX)  # type: ignore[arg-type]
+    tame = lens._tame(read, residual, usable, SIZE_PX)
     assert np.flatnonzero(~tame).tolist() == [3, 17, 41]
 
 
@@ -504,16 +514,21 @@ def test_a_lens_is_its_numbers_and_cubics_or_polynomials_of_a_degree_alone(degre
     assert not along[1].any() and not across[0].any()
 
 
-def test_a_square_s_evenness_is_the_mean_of_its_rows_and_columns(monkeypatch):
-    even = np.arange(40.0).reshape(5, 8)
-    calibration = SimpleNamespace(uniformity_map=lambda size: even)
-    monkeypatch.setattr(estimates, "bench_calibration", lambda config, folder: calibration)
-    monitor = SimpleNamespace(resolution_px=(8, 5))
-    file = SimpleNamespace(config=SimpleNamespace(monitor=monitor), folder=None)
+def test_a_square_s_evenness_is_the_mean_of_its_rows_and_columns(tmp_path: Path):
+    """Of a map of light at places as many as the screen's pixels, relative to its largest."""
+    even = np.arange(1.0, 41.0).reshape(5, 8) / 40
+    np.savetxt(tmp_path / "even.csv", even, delimiter=",")
+    (tmp_path / "r.csv").write_text("code,w\n0,0\n99,0.3\n255,1\n")
+    head = '[calibration]\nkind = "photometric"\nwho = ""\nwhen = ""\ninstrument = ""\nunit = ""\n'
+    head += 'bits = 8\nresponse = "r.csv"\n'
+    squares = []
+    for more in ('[uniformity]\nfile = "even.csv"\n', ""):
+        (tmp_path / "light.toml").write_text(head + more)
+        text = BENCH.format(calibration="light.toml", delay_ms=8.0, geometry="", white=1e6)
+        file = bench_file_of(tmp_path / "bench.toml", text.replace("[1920, 1080]", "[8, 5]"))
+        squares.append(estimates._evenness_in(file, (4, 1, 2)))
     # rows 1 and 2, columns 4 and 5
-    assert estimates._evenness_in(file, (4, 1, 2)) == (12 + 13 + 20 + 21) / 4
-    calibration.uniformity_map = lambda size: None
-    assert estimates._evenness_in(file, (4, 1, 2)) == 1.0
+    assert squares == [pytest.approx((13 + 14 + 21 + 22) / 4 / 40), 1.0]
 
 
 def test_a_finer_grid_has_both_ends_and_no_larger_step():
@@ -588,24 +603,17 @@ def test_a_certificate_has_the_hashes_of_the_bench_s_files_and_of_those_that_the
     }
     for name, text in files.items():
         (tmp_path / name).write_text(text)
-    tracker = SimpleNamespace(
-        distortion=None,
-        optics=SimpleNamespace(psf=None),
-        quantum_efficiencies={"quantum_efficiency": "qe.csv"},
-        transmission=0.9,
+    text = BENCH.format(
+        calibration="light/monitor.toml",
+        delay_ms=8.0,
+        geometry='geometry = "missing.toml"',
+        white=1e6,
     )
-    config = SimpleNamespace(
-        monitor=SimpleNamespace(calibration="light/monitor.toml"),
-        collimator=SimpleNamespace(geometry="missing.toml"),
-        tracker=tracker,
-        sky=SimpleNamespace(catalogue="srgb"),
-    )
-    bench = SimpleNamespace(
-        path=tmp_path / "bench.toml", text="a bench", folder=tmp_path, config=config
-    )
+    text = text.replace('"ccd47-20"', '"qe.csv"')
+    bench = bench_file_of(tmp_path / "bench.toml", text)
     expected = {name: sha256(text.encode()).hexdigest() for name, text in files.items()}
-    expected["bench.toml"] = sha256(b"a bench").hexdigest()
-    assert files_of(bench) == expected  # type: ignore[arg-type]
+    expected["bench.toml"] = sha256(text.encode()).hexdigest()
+    assert files_of(bench) == expected
 
 
 def test_values_that_alternate_have_hardly_a_structure_in_time_and_the_noise_of_their_fit():

@@ -31,9 +31,9 @@ from hilstar.instruments.certify.check import (
     take_check,
     watch,
 )
-from hilstar.server.bench.bench_file import BenchFile, read_bench_file
+from hilstar.server.bench.bench_file import BenchFile
 from tests.support.card_texts import drawn_figures
-from tests.support.planted_certify import BENCH
+from tests.support.planted_certify import stated_bench
 from tests.support.planted_readings import DELAY_MS, WHITE_E_PER_S, PlantedReader, Truth, supposed
 from tests.support.refusals import refusal
 from tests.support.tables import csv_rows
@@ -161,12 +161,8 @@ def test_a_change_of_geometry_is_as_sure_as_its_dots_are_many(bench: BenchFile) 
 
 
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> BenchFile:
-    path = tmp_path_factory.mktemp("check") / "bench.toml"
-    path.write_text(
-        BENCH.format(calibration="srgb", delay_ms=DELAY_MS, geometry="", white=WHITE_E_PER_S)
-    )
-    return read_bench_file(path)
+def bench() -> BenchFile:
+    return stated_bench()
 
 
 def quiet_truth() -> Truth:

@@ -15,7 +15,7 @@ from hilstar.basics.rotation import from_rotation_vector, to_matrix
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.instruments.certify.effects import Effect
 from hilstar.instruments.certify.estimates import surface
-from hilstar.instruments.certify.model import Deviations, Figures, ReferenceStar
+from hilstar.instruments.certify.model import Deviations, Figures
 from hilstar.instruments.certify.read_effects import _of_delays, _places_in, map_at
 from hilstar.instruments.certify.stated_effects import (
     DRIFTS,
@@ -26,7 +26,7 @@ from hilstar.instruments.certify.stated_effects import (
     stated_delay,
 )
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
-from tests.support.planted_certify import BENCH
+from tests.support.planted_certify import BENCH, reference_star
 
 # The tracker of the planted bench: 512 px from its middle, 70 mm in pixels of 13 um.
 EDGE_TANGENT = 512 / (70 / 0.013)
@@ -50,29 +50,41 @@ def bench(folder: Path, keys: str = "", calibration: str = "srgb", geometry: str
     return read_bench_file(path)
 
 
+LIGHT = """[calibration]
+kind = "photometric"
+who = ""
+when = ""
+instrument = ""
+unit = ""
+bits = 8
+response = "light.csv"
+"""
+
+
+def bench_of_light(folder: Path, more: str) -> BenchFile:
+    """The planted bench with a light file of a power of 2.2, and more tables in it."""
+    rows = "".join(f"{code},{(code / 255) ** 2.2!r}\n" for code in range(256))
+    (folder / "light.csv").write_text("code,w\n" + rows)
+    (folder / "light.toml").write_text(LIGHT + more)
+    return bench(folder, calibration="light.toml")
+
+
 def figures_of(file: BenchFile) -> Figures:
     """The figures of the stars above, all of one field."""
     stars = []
     for number, ((x_px, y_px), tangent) in enumerate(zip(PLACES, TANGENTS, strict=True)):
         direction = np.append(EDGE_TANGENT * np.array(tangent), 1.0)
-        stars.append(
-            ReferenceStar(
-                hip=number,
-                row=number,
-                v_mag=5.0,
-                b_v_mag=0.6,
-                field=0,
-                third=0,
-                x_px=x_px,
-                y_px=y_px,
-                direction=direction / np.linalg.norm(direction),
-                quantised_mag=0.0,
-                log_light=np.log([0.5, 0.1]),
-                share=np.array(SHARES),
-                pixel_px=np.zeros((2, 2), dtype=np.intp),
-            )
-        )
+        light = {"log_light": np.log([0.5, 0.1]), "share": np.array(SHARES)}
+        place = {"x_px": x_px, "y_px": y_px, "direction": direction / np.linalg.norm(direction)}
+        stars.append(reference_star(hip=number, row=number, **light, **place))
     return Figures(file, stars)
+
+
+def as_stated() -> Deviations:
+    """A bench that is as its file says."""
+    return Deviations(
+        np.ones((1, 2)), np.zeros((1, COUNT)), np.zeros((1, COUNT, 2)), np.full(1, 8.0), np.zeros(1)
+    )
 
 
 def by_name(effects: list[Effect]) -> dict[str, Effect]:
@@ -196,9 +208,7 @@ def test_what_checks_saw_moves_what_each_of_them_is_of(tmp_path):
 def test_a_bench_that_states_nothing_says_what_is_not_assessed(tmp_path):
     file = bench(tmp_path)
     figures = figures_of(file)
-    value = Deviations(
-        np.ones((1, 2)), np.zeros((1, COUNT)), np.zeros((1, COUNT, 2)), np.full(1, 8.0), np.zeros(1)
-    )
+    value = as_stated()
     missing: list[str] = []
     assert list(of_files(file, figures, value, missing)) == []
     assert list(of_settings(file, figures, missing)) == []
@@ -238,9 +248,7 @@ def of_geometry(folder: Path, error: str) -> dict[str, Effect]:
     """The effects of a geometry file with a table [error]."""
     (folder / "lens.toml").write_text(GEOMETRY + error)
     file = bench(folder, geometry='geometry = "lens.toml"')
-    value = Deviations(
-        np.ones((1, 2)), np.zeros((1, COUNT)), np.zeros((1, COUNT, 2)), np.full(1, 8.0), np.zeros(1)
-    )
+    value = as_stated()
     return by_name(list(of_files(file, figures_of(file), value, [])))
 
 
@@ -310,18 +318,13 @@ def test_an_alignment_s_covariance_turns_the_sky_about_its_own_axes(tmp_path):
 def test_levels_of_a_calibration_move_the_light_that_stars_have_of_them(tmp_path):
     """Level 0.5 is off by 2 %, level 0.1 by none; white is full scale, and has no error of its own."""
     light = [0.01, 0.1, 0.5, 1.0]
-    table = "".join(f"{code},{(code / 255) ** 2.2!r}\n" for code in range(256))
-    (tmp_path / "light.csv").write_text("code,w\n" + table)
-    (tmp_path / "light.toml").write_text(
-        '[calibration]\nkind = "photometric"\nwho = ""\nwhen = ""\ninstrument = ""\nunit = ""\n'
-        f'bits = 8\nresponse = "light.csv"\n[errors]\nlight = {light}\n'
-        "off = [0.0, 0.0, 0.02, 0.0]\nrelative = [0.0, 0.03, 0.04, 0.0]\ndof = 20.0\n"
+    file = bench_of_light(
+        tmp_path,
+        f"[errors]\nlight = {light}\n"
+        "off = [0.0, 0.0, 0.02, 0.0]\nrelative = [0.0, 0.03, 0.04, 0.0]\ndof = 20.0\n",
     )
-    file = bench(tmp_path, calibration="light.toml")
     figures = figures_of(file)
-    value = Deviations(
-        np.ones((1, 2)), np.zeros((1, COUNT)), np.zeros((1, COUNT, 2)), np.full(1, 8.0), np.zeros(1)
-    )
+    value = as_stated()
     response = by_name(list(of_files(file, figures, value, [])))["response"]
     assert np.exp(figures.log_light) == pytest.approx([0.1, 0.5])  # rising
     assert value.levels[0] == pytest.approx([1.0, 1.02])
@@ -334,14 +337,11 @@ def test_levels_are_relative_to_white_with_what_they_have_in_common(tmp_path):
     light, common = np.array([0.05, 0.1, 0.5, 1.0]), 0.002
     relative = np.array([0.06, 0.03, 0.04, 0.01])
     off = np.array([0.03, -0.01, 0.02, 0.005])
-    table = "".join(f"{code},{(code / 255) ** 2.2!r}\n" for code in range(256))
-    (tmp_path / "light.csv").write_text("code,w\n" + table)
-    (tmp_path / "light.toml").write_text(
-        '[calibration]\nkind = "photometric"\nwho = ""\nwhen = ""\ninstrument = ""\nunit = ""\n'
-        f'bits = 8\nresponse = "light.csv"\n[errors]\nlight = {light.tolist()}\n'
-        f"off = {off.tolist()}\nrelative = {relative.tolist()}\ndof = 20.0\ncommon = {common}\n"
+    file = bench_of_light(
+        tmp_path,
+        f"[errors]\nlight = {light.tolist()}\n"
+        f"off = {off.tolist()}\nrelative = {relative.tolist()}\ndof = 20.0\ncommon = {common}\n",
     )
-    file = bench(tmp_path, calibration="light.toml")
     value = as_stated()
     response = by_name(list(of_files(file, figures_of(file), value, [])))["response"]
     black = common / light
@@ -353,13 +353,6 @@ def test_levels_are_relative_to_white_with_what_they_have_in_common(tmp_path):
     (product,) = [response.levels[:, 0] @ response.levels[:, 1]]
     apart = black[of_stars] - black[-1]
     assert product == pytest.approx(own[-1] + apart[0] * apart[1])
-
-
-def as_stated() -> Deviations:
-    """A bench that is as its file says."""
-    return Deviations(
-        np.ones((1, 2)), np.zeros((1, COUNT)), np.zeros((1, COUNT, 2)), np.full(1, 8.0), np.zeros(1)
-    )
 
 
 def test_places_that_a_turn_moves_are_that_turn_of_the_attitude(tmp_path):
@@ -448,17 +441,9 @@ def test_fields_of_a_light_map_are_each_off_by_themselves_and_stars_share_them(t
     """Three fields along and two down, each known to 2 %: a star has what linear weights give it of
     the four about it, which go on beyond the outermost.
     """
-    table = "".join(f"{code},{(code / 255) ** 2.2!r}\n" for code in range(256))
-    (tmp_path / "light.csv").write_text("code,w\n" + table)
     (tmp_path / "even.csv").write_text("1.0,0.98,0.9\n0.97,1.0,0.95\n")
-    (tmp_path / "light.toml").write_text(
-        '[calibration]\nkind = "photometric"\nwho = ""\nwhen = ""\ninstrument = ""\nunit = ""\n'
-        'bits = 8\nresponse = "light.csv"\n[uniformity]\nfile = "even.csv"\nrelative = 0.02\n'
-    )
-    file = bench(tmp_path, calibration="light.toml")
-    value = Deviations(
-        np.ones((1, 2)), np.zeros((1, COUNT)), np.zeros((1, COUNT, 2)), np.full(1, 8.0), np.zeros(1)
-    )
+    file = bench_of_light(tmp_path, '[uniformity]\nfile = "even.csv"\nrelative = 0.02\n')
+    value = as_stated()
     even = by_name(list(of_files(file, figures_of(file), value, [])))["evenness"]
     columns = (np.arange(3) + 0.5) * WIDTH_PX / 3 - 0.5
     rows = (np.arange(2) + 0.5) * HEIGHT_PX / 2 - 0.5

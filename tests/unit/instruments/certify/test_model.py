@@ -2,23 +2,15 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import Any
-
 import numpy as np
 import pytest
 
 from hilstar.basics.rotation import from_rotation_vector, to_matrix
 from hilstar.basics.units import ARCSEC_PER_RAD
-from hilstar.instruments.certify.model import (
-    Deviations,
-    Figures,
-    ReferenceStar,
-    _usable,
-    thirds,
-)
+from hilstar.instruments.certify.model import Deviations, Figures, thirds, usable_stars
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.optics.camera import Camera
+from tests.support.planted_certify import reference_star, stated_bench
 
 # A screen of 800 by 600 px, of whose columns a tracker sees 250 to 550: it stands aside by none.
 SCREEN = Camera((800, 600), 2000.0, (399.5, 299.5), np.eye(3))
@@ -58,15 +50,8 @@ ROWS = (
 def test_stars_stand_alone_whole_on_the_screen_and_in_the_tracker():
     kind = [("x_px", "f4"), ("y_px", "f4"), ("drawn", "?"), ("clipped", "?")]
     rows = np.array([row[:4] for row in ROWS], dtype=kind)
-    star = np.arange(len(ROWS))[::-1]
-    catalogue_row = np.array([7 if row[4] else -1 for row in ROWS])[::-1]
-    bench: Any = SimpleNamespace(
-        psf=SimpleNamespace(width_px=(2.0, 1.5)),
-        stars=SimpleNamespace(row=catalogue_row),
-        camera=SCREEN,
-    )
-    frame: Any = SimpleNamespace(rows=rows, star=star)
-    assert _usable(bench, frame, NARROW).tolist() == [row[5] for row in ROWS]
+    of_catalogue = np.array([row[4] for row in ROWS])
+    assert usable_stars(rows, of_catalogue, 2.0, NARROW).tolist() == [row[5] for row in ROWS]
 
 
 def test_a_star_at_the_screen_s_edge_has_all_of_its_pixels():
@@ -82,15 +67,10 @@ def test_a_star_at_the_screen_s_edge_has_all_of_its_pixels():
         (790.1, 99),
     ]
     rows = np.array([(x, y, True, False) for x, y in at_px], dtype=kind)
-    bench: Any = SimpleNamespace(
-        psf=SimpleNamespace(width_px=(2.0, 2.0)),
-        stars=SimpleNamespace(row=np.zeros(9, dtype=int)),
-        camera=SCREEN,
-    )
     wide = BenchGeometry(SCREEN, Camera((900, 700), 2000.0, (449.5, 349.5), np.eye(3)))
-    frame: Any = SimpleNamespace(rows=rows, star=np.arange(len(rows)))
     wanted = [False, True, False, True, False, True, False]
-    assert _usable(bench, frame, wide).tolist() == wanted
+    every = np.ones(len(rows), dtype=bool)
+    assert usable_stars(rows, every, 2.0, wide).tolist() == wanted
 
 
 @pytest.mark.parametrize("turn_arcsec", [(3.0, -5.0, 40.0), (-20.0, 7.0, -90.0)])
@@ -99,10 +79,10 @@ def test_stars_on_one_line_tell_a_turn_and_no_mirror(turn_arcsec):
     tangents = 0.05 * np.array([[-1.0, -0.4], [0.0, 0.0], [0.5, 0.2], [1.5, 0.6]])
     rays = np.column_stack([tangents, np.ones(4)])
     directions = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    stars = [star_at(direction, 0.3 * k) for k, direction in enumerate(directions)]
-    certify = SimpleNamespace(rate_deg_s=0.0)
-    config = SimpleNamespace(certify=certify, monitor=SimpleNamespace(panel_delay_ms=0.0))
-    figures = Figures(SimpleNamespace(config=config), stars)  # type: ignore[arg-type]
+    figures = Figures(
+        stated_bench("[certify]\nrate_deg_s = 0.0\n"),
+        [reference_star(direction=direction) for direction in directions],
+    )
     turned = directions @ to_matrix(from_rotation_vector(np.array(turn_arcsec) / ARCSEC_PER_RAD)).T
     moved = ARCSEC_PER_RAD * (turned[:, :2] / turned[:, 2:] - tangents)
     off = Deviations(np.ones((1, 1)), np.zeros((1, 4)), moved[None], np.zeros(1), np.zeros(1))
@@ -110,21 +90,3 @@ def test_stars_on_one_line_tell_a_turn_and_no_mirror(turn_arcsec):
     for axis, arcsec in zip("xyz", turn_arcsec, strict=True):
         number = figures.names.index((f"attitude_{axis}", -1, "arcsec"))
         assert found[number] == pytest.approx(arcsec, abs=1e-4)
-
-
-def star_at(direction: np.ndarray, b_v_mag: float) -> ReferenceStar:
-    return ReferenceStar(
-        hip=1,
-        row=0,
-        v_mag=5.0,
-        b_v_mag=b_v_mag,
-        field=0,
-        third=0,
-        x_px=100.0,
-        y_px=100.0,
-        direction=direction,
-        quantised_mag=0.0,
-        log_light=np.zeros(1),
-        share=np.ones(1),
-        pixel_px=np.zeros((1, 2), dtype=np.intp),
-    )

@@ -4,17 +4,18 @@ edges that go together, light that a map leaves.
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from hilstar.instruments.certify.bench_readings import BesideRatio
+from hilstar.instruments.certify.bench_readings import BesideRatio, DotReadings
 from hilstar.instruments.certify.estimates import Evenness, LightDeviation, Surface
-from hilstar.instruments.certify.lens import Places
+from hilstar.instruments.certify.lens import LensFit, lens_fit
+from hilstar.instruments.certify.model import Figures
 from hilstar.instruments.certify.read_effects import (
     MapAtStars,
     Read,
@@ -25,6 +26,8 @@ from hilstar.instruments.certify.read_effects import (
     of_readings,
 )
 from hilstar.instruments.certify.structure import Cells, Structure, in_time
+from hilstar.server.bench.bench_file import BenchFile
+from tests.support.planted_certify import reference_star, stated_bench
 
 SIZE_PX = (1920, 1080)
 NONE = Structure(np.ones(1), np.zeros(1), 1.0, math.inf)
@@ -52,14 +55,12 @@ def light_read(value: np.ndarray) -> LightDeviation:
     )
 
 
-def figures() -> Any:
+def figures() -> Figures:
     """Three stars, whose codes are those read and one between."""
-    return SimpleNamespace(
-        log_light=np.log([0.1, 0.2, 1.0]),
-        stars=[None] * STARS,
-        x_px=np.array([300.0, 960.0, 1500.0]),
-        y_px=np.array([200.0, 100.0, 900.0]),
-    )
+    stars = []
+    for light, x_px, y_px in ((0.1, 300.0, 200.0), (0.2, 960.0, 100.0), (1.0, 1500.0, 900.0)):
+        stars.append(reference_star(log_light=np.log([light]), x_px=x_px, y_px=y_px))
+    return Figures(stated_bench(), stars)
 
 
 def even_read(structure: Structure = NONE) -> Evenness:
@@ -132,28 +133,33 @@ def test_light_that_a_map_leaves_counts_relative_to_where_light_was_read(length_
     the square has the mean of 49 places.
     """
     structure = Structure(np.array([length_px]), np.array([4e-4]), 1.0, 9.0)
-    read = SimpleNamespace(light=light_read(np.ones(4)), even=even_read(structure))
-    effect = _of_uneven_light(figures(), read)  # type: ignore[arg-type]
+    effect = _of_uneven_light(figures(), even_read(structure), SQUARE_PX)
     variance = (effect.even**2).sum(axis=0)
     assert variance == pytest.approx(left * 4e-4 * (1 + 1 / 49), abs=1e-8)
     assert effect.input.dof == 9.0
 
 
-def read_of(delays_ms: list[float]) -> Any:
-    """A bench's readings with these edges; its places are as its file has them."""
-    places = Places(
-        np.zeros((STARS, 2)), np.zeros((1, STARS, 2)), 9.0, np.zeros((0, STARS, 2)), NONE
+@functools.cache
+def fitted_lens() -> LensFit:
+    """Of 12 by 9 dots with noise of 0.1 arcsec; no figure here goes by it."""
+    x_px, y_px = (
+        at.ravel() for at in np.meshgrid(np.arange(300, 1620, 110), np.arange(99, 981, 98))
     )
-    lens = SimpleNamespace(at=lambda x_px, y_px: places)
-    return Read(light_read(np.ones(4)), even_read(), lens, np.array(delays_ms))  # type: ignore[arg-type]
+    dots = DotReadings(x_px, y_px, x_px, y_px, np.ones(len(x_px)))
+    noise_arcsec = 0.1 * np.random.default_rng(1).standard_normal((len(x_px), 2))
+    return lens_fit(stated_bench(), dots, noise_arcsec)
 
 
-def stating(panel_delay_u_ms: float | None) -> Any:
+def read_of(delays_ms: list[float]) -> Read:
+    """A bench's readings with these edges."""
+    return Read(light_read(np.ones(4)), even_read(), fitted_lens(), np.array(delays_ms))
+
+
+def stating(panel_delay_u_ms: float | None) -> BenchFile:
     """A bench file that states a delay of 8 ms, and how well it is known."""
-    tracker = SimpleNamespace(direction_expanded_arcsec=None)
-    certify = SimpleNamespace(tracker=tracker, panel_delay_u_ms=panel_delay_u_ms)
-    monitor = SimpleNamespace(panel_delay_ms=8.0)
-    return SimpleNamespace(config=SimpleNamespace(certify=certify, monitor=monitor))
+    if panel_delay_u_ms is None:
+        return stated_bench()
+    return stated_bench(f"[certify]\npanel_delay_u_ms = {panel_delay_u_ms}\n")
 
 
 @pytest.mark.parametrize(

@@ -2,38 +2,31 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from hilstar.instruments.certify import sky_effects
+from hilstar.instruments.certify.model import Figures
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import bench_text
-
-MAG, ARCSEC, SPECTRUM = 0.01, 0.1, 0.02
+from tests.support.planted_certify import reference_star, stated_bench
 
 
 @pytest.mark.parametrize(
     ("lost_mag", "scatter"), [([0.3, 0.1], 0.0), ([0.3, 0.1, 0.2], 0.1), ([0.4] * 4, 0.0)]
 )
-def test_each_star_has_its_own_errors_and_all_have_one_spectrum(lost_mag, scatter, monkeypatch):
+def test_each_star_has_its_own_errors_and_all_have_one_spectrum(lost_mag, scatter):
     """What codes lose scatters by three stars or more."""
-    count = len(lost_mag)
-    own = 1 + np.arange(count)
-    monkeypatch.setattr(
-        sky_effects, "catalogue_errors", lambda file, rows: (MAG * own, ARCSEC * rows)
-    )
-    monkeypatch.setattr(sky_effects, "spectrum_mag", lambda file, b_v: (SPECTRUM * b_v, "planted"))
-    stars = [
-        SimpleNamespace(row=10 + k, b_v_mag=0.5 * k, quantised_mag=mag)
-        for k, mag in enumerate(lost_mag)
-    ]
-    figures = SimpleNamespace(stars=stars)
+    file, count = stated_bench(), len(lost_mag)
+    stars = []
+    for k, mag in enumerate(lost_mag):
+        stars.append(reference_star(row=10 + k, b_v_mag=0.5 * k, quantised_mag=mag))
     effects = {
-        effect.input.name: effect
-        for effect in sky_effects.of_sky(None, figures)  # type: ignore[arg-type]
+        effect.input.name: effect for effect in sky_effects.of_sky(file, Figures(file, stars))
     }
+    own_mag, own_arcsec = sky_effects.catalogue_errors(file, 10 + np.arange(count))
+    colour, _ = sky_effects.spectrum_mag(file, 0.5 * np.arange(count))
+    assert len({*own_mag.tolist(), *own_arcsec.tolist()}) == 2 * count
     covariances = {}
     for name, effect in effects.items():
         assert effect.sky is not None and len(effect.sky) == effect.input.size
@@ -41,15 +34,13 @@ def test_each_star_has_its_own_errors_and_all_have_one_spectrum(lost_mag, scatte
         covariances[name] = (slopes.T @ slopes).reshape(3, count, 3, count)
     nothing = np.zeros((count, count))
     light = covariances["catalogue light"]
-    assert light[0, :, 0] == pytest.approx(np.diag((MAG * own) ** 2))
+    assert light[0, :, 0] == pytest.approx(np.diag(own_mag**2))
     place = covariances["catalogue place"]
-    of_rows = np.diag((ARCSEC * (10 + np.arange(count))) ** 2)
     for along in (1, 2):
-        assert place[along, :, along] == pytest.approx(of_rows)
+        assert place[along, :, along] == pytest.approx(np.diag(own_arcsec**2))
         assert light[along, :, along] == pytest.approx(nothing)
     assert place[1, :, 2] == pytest.approx(nothing)
     assert place[0, :, 0] == pytest.approx(nothing)
-    colour = SPECTRUM * 0.5 * np.arange(count)
     assert covariances["spectrum"][0, :, 0] == pytest.approx(np.outer(colour, colour))
     codes = covariances["quantisation"][0, :, 0]
     assert codes == pytest.approx(scatter**2 * np.eye(count))

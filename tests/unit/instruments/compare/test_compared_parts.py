@@ -15,8 +15,10 @@ from hilstar.instruments.compare.star_fit import Seeds, _blended, _has, _sigma_p
 from hilstar.instruments.simulate.eye_picture import _blocks
 from hilstar.instruments.simulate.noise import found_share
 from hilstar.instruments.simulate.simulator import FaultyExposure
-from hilstar.instruments.verify.measure import DECENTRED, HIGHER, LENS, TILT, _parts
+from hilstar.instruments.verify.measure import DECENTRED, HIGHER, LENS, TILT, Star, _parts
 from hilstar.instruments.verify.summary import _by_magnitude
+from hilstar.instruments.verify.verdict import DisplayErrors
+from hilstar.optics.layers.truth import TRUTH_DTYPE
 
 
 @pytest.mark.parametrize("sigma_px", [0.3, 0.9, 2.0])
@@ -36,17 +38,12 @@ def test_a_blend_is_at_its_first_star_and_has_all_names():
 
 @pytest.mark.parametrize(("near", "has"), [(0, False), (1, False), (2, True), (3, True)])
 def test_a_table_is_of_a_sky_by_half_of_its_brightest_stars(near, has):
-    truth = {"x_px": np.array([10.0, 30.0, 50.0]), "y_px": np.array([10.0, 10.0, 10.0])}
-
-    class Table(dict):
-        """Three rows."""
-
-        def __len__(self):
-            return 3
-
+    truth = np.zeros(3, dtype=TRUTH_DTYPE)
+    truth["x_px"] = [10.0, 30.0, 50.0]
+    truth["y_px"] = 10.0
     found = np.array([[10.0, 10.5], [30.0, 10.5], [50.0, 10.5]])
     found[near:, 1] += 20
-    assert _has(Table(truth), found, 1.0) == has
+    assert _has(truth, found, 1.0) == has
 
 
 def test_a_star_is_gone_that_is_too_faint_or_too_far_whichever_way():
@@ -95,12 +92,10 @@ def test_tilts_are_small_turns_about_both_axes_and_lenses_are_those_of_brown(rng
 
 
 def test_magnitudes_have_rows_from_the_brightest_star_on():
-    v_mag = np.array([-1.4, 0.5, 0.6, 3.0])
-    errors = SimpleNamespace(
-        of=lambda name: v_mag if name == "v_mag" else np.full(4, 0.01),
-        centroid_px=lambda: np.full(4, 0.1),
-    )
-    rows = _by_magnitude(errors)
+    stars = []
+    for v_mag in (-1.4, 0.5, 0.6, 3.0):
+        stars.append(Star(1, v_mag, 10.0, 20.0, 0.01, 0.06, 0.08, 0.01, 0.1, 0.0, 0.0))
+    rows = _by_magnitude(DisplayErrors(stars, [], 0.0, 0.0, None))
     assert [(row["v_from"], row["v_to"], row["stars"]) for row in rows] == [
         (-2, -1, 1),
         (0, 1, 2),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
@@ -18,6 +16,7 @@ from hilstar.instruments.confront.background import (
     sky_level,
     source_mask,
 )
+from tests.support.confrontations import sources_at
 
 HIGH_PX, WIDE_PX = 200, 320
 NOISE_DN = 6.0
@@ -180,10 +179,7 @@ def test_sky_beyond_the_clip_is_a_star_s(rng):
 def test_what_is_left_out_about_a_long_source_is_bounded(length_px, half_px):
     """A trail across the whole image leaves the rest of it."""
     dark = np.zeros((300, 300))
-    trail = SimpleNamespace(
-        x_px=np.array([150.0]), y_px=np.array([140.0]), length_px=np.array([length_px])
-    )
-    mask = source_mask(trail, dark, 2)
+    mask = source_mask(sources_at([(150.0, 140.0)], length_px=length_px), dark, 2)
     y, x = np.indices(dark.shape)
     reach_px = half_px + 2
     assert np.array_equal(mask, (abs(y - 140) <= reach_px) & (abs(x - 150) <= reach_px))

@@ -5,7 +5,6 @@ known, and what a photograph's stars and sources say of clouds: each planted in 
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -38,6 +37,8 @@ from hilstar.instruments.confront.photographed_sky import DatedSky
 from hilstar.instruments.confront.session import _solve
 from hilstar.optics.camera import Camera, Lens
 from hilstar.sky.catalog import load_catalog
+from hilstar.sky.stars import AirAbove
+from tests.support.confrontations import a_shot, sources_at
 from tests.support.planted_sky import rotation_of
 from tests.unit.instruments.confront.test_parts import row_of
 
@@ -74,7 +75,7 @@ def fitted(rng, base: Camera, *, fixed: bool) -> tuple[CameraFit, list[np.ndarra
         turns.append(turn)
         photographs.append(places)
         # an air that bends nothing: refraction is not looked for
-        air = SimpleNamespace(bent=lambda vectors: vectors)
+        air = AirAbove(np.array([0.0, 0.0, 1.0]), (0.0, 0.0))
         pointings.append(Pointing(multiply(off, from_matrix(turn)), air=air))
     return fit_camera(base, pointings, photographs, fixed=fixed, last=True), turns, photographs
 
@@ -251,20 +252,10 @@ def test_missing_stars_tell_of_an_obstacle():
 
 def explained(**changes) -> str:
     """What a source at (35, 12) is, in an image of 50 x 30 pixels with nothing that explains it."""
-    source = {
-        "x_px": np.array([35.0]),
-        "y_px": np.array([12.0]),
-        "snr": np.array([20.0]),
-        "length_px": np.array([3.0]),
-        "trail": np.array([False]),
-        "single": np.array([False]),
-    }
-    source |= changes.pop("source", {})
-    places_px = np.column_stack([source["x_px"], source["y_px"]])
-    sky = SimpleNamespace(name=lambda star: f"star {star}")
-    shot = SimpleNamespace(sources=SimpleNamespace(**source, places_px=places_px), sky=sky)
+    sources = sources_at([(35.0, 12.0)], snr=20.0, length_px=3.0)
+    sources = replace(sources, **changes.pop("source", {}))
     parts = {
-        "shot": shot,
+        "shot": replace(a_shot(0), sources=sources),
         "expected": None,
         "tree": None,
         "planets": {},
@@ -318,17 +309,17 @@ def test_what_is_beside_a_trail_is_within_half_its_length_and_five_pixels(off_px
         "y_px": np.array([12.0, 12.0]),
         "snr": np.array([20.0, 90.0]),
         "length_px": np.array([3.0, 40.0]),
-        "trail": np.array([False, True]),
+        "width_px": np.array([2.0, 2.0]),
         "single": np.array([False, False]),
     }
     assert explained(source=source) == words
 
 
 def test_a_trail_has_the_name_of_a_satellite_within_its_length_and_two_tenths_of_a_degree():
-    trail = {"trail": np.array([True]), "length_px": np.array([8.0])}
-    # 4 px and 0.2 deg of 1000 px, 3.5 px
-    assert explained(source=trail, satellites={"ISS": (42.0, 12.0)}) == "ISS, 8 px long"
-    assert explained(source=trail, satellites={"ISS": (43.0, 12.0)}) == "a trail, 8 px long"
+    trail = {"width_px": np.array([1.0]), "length_px": np.array([20.0])}
+    # 10 px and 0.2 deg of 1000 px, 3.5 px
+    assert explained(source=trail, satellites={"ISS": (48.0, 12.0)}) == "ISS, 20 px long"
+    assert explained(source=trail, satellites={"ISS": (49.0, 12.0)}) == "a trail, 20 px long"
 
 
 @pytest.mark.parametrize("tangents", [(1.2, 0.7), (-0.4, 1.5), (0.9, -1.1)])

@@ -6,29 +6,40 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from hilstar.instruments.confront import judge
+from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.instruments.confront.background import SkyLevel
+from hilstar.instruments.confront.camera_fit import CameraFit, Pointing
 from hilstar.instruments.confront.judge import (
     Expected,
-    Judge,
     StarRow,
     _dim_regions,
     _Explanation,
     _judged_cell,
+    background_of,
+    boresights_moved_px,
     chi2_of,
+    dated_by,
     in_sigmas,
+    missing_stars,
+    planets_on,
     utc_of,
 )
+from hilstar.instruments.confront.photographed_sky import DatedSky
 from hilstar.instruments.confront.session import MATCH_PX
-from tests.support.confrontations import a_shot
+from hilstar.optics.camera import Camera
+from hilstar.sky.catalog import plain_catalog
+from hilstar.sky.stars import unit_vectors_icrs
+from tests.support.confrontations import a_shot, a_star, seen_shot, sources_at
 
 SIZE_PX = (800, 400)
+FOCAL_PX = 3000.0
+CAMERA = Camera(SIZE_PX, FOCAL_PX, (410.0, 190.0), np.eye(3), None)
 
 
 def test_a_residual_is_in_sigmas_of_background_and_shot_noise():
@@ -51,33 +62,32 @@ def test_a_photograph_s_time_is_kept_to_the_millisecond():
     assert utc_of(t_ns + 999_999) == "2026-03-20T21:34:56.789Z"
 
 
-def pointing(x_rad: float, y_rad: float) -> Any:
-    """A camera turned so far about ICRS's y and x axes."""
-    half_x, half_y = x_rad / 2, y_rad / 2
-    return SimpleNamespace(q_icrs_to_cam=np.array([1.0, half_y, half_x, 0.0]))
+def pointing(ra_deg: float, dec_deg: float) -> Pointing:
+    return Pointing(from_radec_roll_deg(ra_deg, dec_deg, 0.0))
 
 
-@pytest.mark.parametrize("along", [(0.01, 0.0), (0.0, 0.01)])
+@pytest.mark.parametrize("along", [(1.0, 0.0), (0.0, 1.0)])
 def test_photographs_have_moved_by_the_largest_part_of_their_boresights(along):
     """0.01 rad along one axis of the sky, of 3000 px a radian."""
-    pointings = [pointing(0.0, 0.0), pointing(*along), pointing(along[0] / 2, along[1] / 2)]
-    camera = SimpleNamespace(pointings=pointings, camera=SimpleNamespace(focal_length_px=3000.0))
-    judging: Any = SimpleNamespace(session=SimpleNamespace(camera=camera))
-    assert Judge._moved_px(judging) == pytest.approx(30.0, rel=1e-3)
+    turn_deg = math.degrees(0.01)
+    turned = [pointing(part * along[0], part * along[1]) for part in (0, turn_deg, turn_deg / 2)]
+    assert boresights_moved_px(CameraFit(CAMERA, tuple(turned), "")) == pytest.approx(30, rel=1e-3)
 
 
-def test_planets_beside_the_image_have_their_places_and_those_behind_none(monkeypatch):
-    seen = {"Mars": [1.0, 0.0, 0.0], "Venus": [0.0, 1.0, 0.0], "Saturn": [0.0, 0.0, 1.0]}
-    monkeypatch.setattr(judge, "planets_seen", lambda t_ns: seen)
-    places = np.array([-50.0, 900.0, np.nan]), np.array([-3.0, 20.0, np.nan])
-    looking = SimpleNamespace(places_px=lambda camera, vectors: places)
-    camera = SimpleNamespace(pointings=[looking], camera=None)
-    photo = SimpleNamespace(t_ns=1)
-    session = SimpleNamespace(shots=[SimpleNamespace(photo=photo)], camera=camera)
-    judging: Any = SimpleNamespace(session=session)
-    assert Judge._planets(judging, 0) == {"Mars": (-50.0, -3.0), "Venus": (900.0, 20.0)}
-    photo.t_ns = None
-    assert Judge._planets(judging, 0) == {}
+def test_planets_beside_the_image_have_their_places_and_those_behind_none():
+    """Jupiter and Saturn stood 6.1 arcmin apart, at RA 302.6 and Dec -20.5, on 2020-12-21; Neptune
+    47 degrees to the east, and Uranus 97.
+    """
+    t_ns = int(np.datetime64("2020-12-21T18:20:00", "ns").astype(np.int64))
+    places = planets_on(t_ns, pointing(302.6, -20.5), CAMERA)
+    jupiter_px, saturn_px = np.array(places["Jupiter"]), np.array(places["Saturn"])
+    assert math.dist(jupiter_px, CAMERA.principal_point_px) < FOCAL_PX * math.radians(0.2)
+    apart_px = FOCAL_PX * math.radians(6.1 / 60)
+    assert math.dist(jupiter_px, saturn_px) == pytest.approx(apart_px, rel=0.03)
+    neptune_px = CAMERA.principal_point_px[0] - FOCAL_PX * math.tan(math.radians(47))
+    assert places["Neptune"][0] == pytest.approx(neptune_px, rel=0.1)
+    assert "Uranus" not in places
+    assert planets_on(None, pointing(302.6, -20.5), CAMERA) == {}
 
 
 def expected(places_px: list[tuple[float, float]], dn: list[float]) -> Expected:
@@ -87,9 +97,9 @@ def expected(places_px: list[tuple[float, float]], dn: list[float]) -> Expected:
 
 def explanation(stars: Expected, snr: float, length_px: float) -> _Explanation:
     """One source at (100, 50), of pixels with a noise of 2 DN."""
-    sources = SimpleNamespace(snr=np.array([snr]), length_px=np.array([length_px]))
+    sources = sources_at([(100.0, 50.0)], snr=snr, length_px=length_px)
     return _Explanation(
-        shot=SimpleNamespace(sources=sources),  # type: ignore[arg-type]
+        shot=replace(a_shot(0), sources=sources),
         expected=stars,
         tree=cKDTree(np.column_stack([stars.x_px, stars.y_px])),
         planets={},
@@ -98,7 +108,7 @@ def explanation(stars: Expected, snr: float, length_px: float) -> _Explanation:
         hot=np.zeros((9, 9), dtype=bool),
         light_sigma=np.zeros((9, 9)),
         pixel_dn=2.0,
-        focal_length_px=3000.0,
+        focal_length_px=FOCAL_PX,
     )
 
 
@@ -126,40 +136,24 @@ def test_missing_stars_are_bright_alone_and_within_the_image():
     above_dn = np.zeros((400, 800))
     above_dn[100, 500] = 30.5
     above_dn[99, 600] = 29.5
-    sources = SimpleNamespace(places_px=np.array([[200.0, 100.0 + edge_px - 0.1]]))
-    found = SimpleNamespace(x_px=np.array([330.0, 305.0]), y_px=np.array([100.0, 100.0]))
-    shot = SimpleNamespace(
-        star=np.array([99, 98]),
+    flat = np.zeros_like(above_dn)
+    shot = seen_shot(
+        [(330.0, 100.0), (305.0, 100.0)],
+        [99, 98],
+        photo=replace(a_shot(0).photo, dn=above_dn),
+        level=SkyLevel(flat, flat + 1.0, 16),
         saturated=np.array([False, True]),
-        found=found,
-        sources=sources,
-        photo=SimpleNamespace(size_px=SIZE_PX),
-        above_dn=above_dn,
+        sources=sources_at([(200.0, 100.0 + edge_px - 0.1)]),
     )
-    judging: Any = SimpleNamespace(_pixel_variance=lambda shot: 1.0)
-    assert list(Judge._missing(judging, shot, stars)) == [10, 15, 17]
+    assert list(missing_stars(shot, stars, 1.0)) == [10, 15, 17]
     shot.star = np.array([10, 98])
-    assert list(Judge._missing(judging, shot, stars)) == [15, 17]
+    assert list(missing_stars(shot, stars, 1.0)) == [15, 17]
 
 
 def row_at(x_px: float, y_px: float, off_mag: float, **changes: Any) -> StarRow:
     """A star of 1000 DN that is too faint by so much."""
-    row = StarRow(
-        star=1,
-        hip=1,
-        name="",
-        x_px=x_px,
-        y_px=y_px,
-        x_predicted_px=x_px,
-        y_predicted_px=y_px,
-        dn=1000 * 10 ** (-0.4 * off_mag),
-        sigma_dn=1.0,
-        dn_predicted=1000.0,
-        v_mag=4.0,
-        b_v_mag=0.6,
-        flags=(),
-    )
-    return replace(row, **changes)
+    light = {"dn": 1000 * 10 ** (-0.4 * off_mag), "dn_predicted": 1000.0, "sigma_dn": 1.0}
+    return a_star("", 1, 4.0, (x_px, y_px), **(light | changes))
 
 
 def missing_at(x_px: float, y_px: float) -> StarRow:
@@ -211,40 +205,32 @@ def test_dim_parts_are_named_by_the_quarter_of_an_image_that_is_no_square(x_px, 
 
 
 @pytest.mark.parametrize(("floor_px", "used_px"), [(0.3, 0.3), (0.001, 0.02)])
-def test_a_date_is_told_by_the_stars_that_move_and_by_their_places_errors(
-    floor_px, used_px, monkeypatch
-):
-    """Four stars move by 0.4 px a year along x, and are 0.8 px on: two years late, by places that
-    are known to 0.4 px each and to the camera's floor. The fifth is not clean.
+def test_a_date_is_told_by_the_stars_that_move_and_by_their_places_errors(floor_px, used_px):
+    """Four stars move by 0.4 px a year to the east, which is left, and are 0.8 px on: two years
+    late, by places that are known to 0.4 px each and to the camera's floor. The fifth is not clean.
     """
-    now = np.array(
-        [[0.1, 0.2, 1.0], [0.3, 0.1, 1.0], [0.2, 0.4, 1.0], [0.0, 0.0, 1.0], [9.0, 9, 1]]
-    )
-    monkeypatch.setattr(
-        judge,
-        "unit_vectors_icrs",
-        lambda catalog, epoch: np.array([4e-4 * (epoch - 2020.0), 0.0, 0.0]) + catalog,
-    )
+    places_deg = np.array([[359.9, 0.1], [0.3, -0.2], [0.2, 0.4], [0.0, 0.0], [1.0, 1.0]])
+    ra_deg, dec_deg = places_deg.T
+    mas_yr = math.degrees(0.4 / FOCAL_PX) * 3.6e6
+    columns = {"ra_deg": ra_deg, "dec_deg": dec_deg, "v_mag": np.full(5, 4.0)}
+    catalog = plain_catalog("HIP", 5, columns | {"pm_ra_cosdec_mas_yr": np.full(5, mas_yr)})
     order = np.array([4, 3, 2, 1, 0])
-    by_row = SimpleNamespace(taken=lambda rows: now[::-1][rows])
-    sky = SimpleNamespace(catalog=by_row, order=order, epoch_jyear=2020.0, vectors=now)
-    star = np.array([3, 0, 4, 1, 2])
-    places_px = 1000 * now[star, :2] + [0.8, 0.0]
-    shot = SimpleNamespace(
-        clean=np.array([True, True, False, True, True]),
-        star=star,
-        sky=sky,
-        found=SimpleNamespace(places_px=places_px, sigma_px=np.full(5, 0.4)),
-    )
-    looking = SimpleNamespace(places_px=lambda camera, vectors: (1000 * vectors[:, :2]).T)
-    camera = SimpleNamespace(pointings=[looking], camera=None, floor_px=floor_px)
-    judging: Any = SimpleNamespace(session=SimpleNamespace(shots=[shot], camera=camera))
-    found = Judge._dated(judging, 0)
+    vectors = unit_vectors_icrs(catalog, 2020.0)[order]
+    camera = CameraFit(CAMERA, (pointing(0.0, 0.0),), "", floor_px=floor_px)
+    star = [3, 0, 4, 1, 2]
+    now_px = np.column_stack(camera.pointings[0].places_px(CAMERA, vectors[star]))
+    blended = np.array([False, True, False, False, False])
+    sky = DatedSky(catalog, 2020.0, None, vectors, order)
+    shot = seen_shot(now_px - [0.8, 0.0], star, sky=sky, blended=blended)
+    shot.found.sigma_px[:] = 0.4
+    shot.found.x_px[1] += 50.0
+    found = dated_by(shot, camera.pointings[0], camera)
     assert found is not None
-    assert found.years == pytest.approx(2.0)
-    assert found.sigma == pytest.approx(math.hypot(0.4, used_px) / (0.4 * 2))
-    shot.clean[:] = False
-    assert Judge._dated(judging, 0) is None
+    # along the image's plane a degree from its middle is 1.0003 times as long
+    assert found.years == pytest.approx(2.0, rel=1e-3)
+    assert found.sigma == pytest.approx(math.hypot(0.4, used_px) / (0.4 * 2), rel=1e-3)
+    shot.blended = np.ones(5, dtype=bool)
+    assert dated_by(shot, camera.pointings[0], camera) is None
 
 
 def test_a_background_has_neither_light_nor_sources_nor_defects():
@@ -259,16 +245,10 @@ def test_a_background_has_neither_light_nor_sources_nor_defects():
     light_sigma = np.zeros((height, width))
     light_sigma[10, 20] = 0.11
     light_sigma[10, 40] = 0.09
-    judging: Any = SimpleNamespace(hot=hot, dead=dead)
-    background = Judge._background(judging, shot, light_sigma)
+    background = background_of(shot, light_sigma, hot, dead)
     left_out = np.argwhere(~background).tolist()
     assert left_out == [[3, 4], [10, 20], [50, 60]]
-    at_px = np.array([30.0])
-    one = np.ones(1)
-    no = np.zeros(1, dtype=bool)
-    source = replace(shot.sources, x_px=at_px, y_px=at_px, snr=9 * one, fwhm_px=2 * one)
-    source = replace(source, length_px=2 * one, width_px=2 * one, single=no)
-    shot.sources = source
-    with_source = Judge._background(judging, shot, light_sigma)
+    shot.sources = sources_at([(30.0, 30.0)])
+    with_source = background_of(shot, light_sigma, hot, dead)
     assert not with_source[30, 30]
     assert with_source.sum() < background.sum()

@@ -6,25 +6,25 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from hilstar.instruments.confront import excess
-from hilstar.instruments.confront.background import fixed_pattern
+from hilstar.instruments.confront.background import FixedPattern, fixed_pattern
 from hilstar.instruments.confront.excess import (
-    HALF,
     LAW,
     Part,
     _blends,
+    _by_law,
     _response,
     _rest,
     _scintillation,
+    _Sightings,
     _variables,
     shot_sigma,
 )
+from hilstar.instruments.confront.judge import Expected, StarRow, Verdict
 from hilstar.instruments.confront.light import (
     CORRECTION_PRIOR,
     MAX_CORRECTION,
@@ -40,6 +40,15 @@ from hilstar.instruments.confront.light import (
     fit_light,
     join_light,
     with_extinction,
+)
+from hilstar.instruments.confront.star_psf import StarPsf
+from tests.support.confrontations import (
+    a_session,
+    a_shot,
+    a_star,
+    a_verdict,
+    seen_shot,
+    some_pixels,
 )
 
 MAG_A_RELATIVE = 2.5 / math.log(10)
@@ -247,40 +256,40 @@ def test_stars_that_are_held_out_are_not_in_their_own_fit():
     assert math.isnan(_held_out(np.ones((4, 1)), np.zeros(4), np.ones(4), np.zeros(4, dtype=bool)))
 
 
-def row(star: int, off_mag: float = 0.0, flags: tuple[str, ...] = (), **changes: Any) -> Any:
-    facts = {"star": star, "off_mag": off_mag, "flags": flags}
-    return SimpleNamespace(**(facts | changes))
+def row(star: int, off_mag: float = 0.0, **changes: Any) -> StarRow:
+    """A star that is so much fainter than predicted."""
+    dn = 1000 * 10 ** (-0.4 * off_mag)
+    light = {"dn": dn, "dn_predicted": 1000.0}
+    return a_star("", star, 4.0, (10.0, 20.0), **(light | changes))
 
 
-def sightings(rows: list[Any], **changes: Any) -> Any:
+def sightings(rows: list[StarRow], verdicts: list[Verdict] | None = None) -> _Sightings:
     """Stars that count, as the parts of an excess ask for them."""
-    off_mag = np.array([each.off_mag for each in rows])
-    facts = {"rows": rows, "off_mag": off_mag, "verdicts": [None] * len(rows)}
-    return SimpleNamespace(**(facts | changes))
+    return _Sightings(verdicts or [a_verdict(a_shot(0), 0)] * len(rows), rows)
 
 
 def test_a_star_s_place_has_its_own_error_in_its_own_photograph():
-    found = SimpleNamespace(sigma_px=np.array([0.1, 0.2, 0.3]))
-    verdict: Any = SimpleNamespace(shot=SimpleNamespace(star=np.array([5, 7, 9]), found=found))
+    shot = seen_shot([(1.0, 2.0)] * 3, [5, 7, 9])
+    shot.found.sigma_px[:] = [0.1, 0.2, 0.3]
+    verdict = a_verdict(shot, 0)
     assert [shot_sigma(verdict, row(star)).tolist() for star in (7, 5)] == [[0.2], [0.1]]
     assert shot_sigma(verdict, row(8)).tolist() == []
 
 
-def test_what_changes_between_photographs_is_beyond_noise_and_by_the_stars_seen_again(monkeypatch):
+def test_what_changes_between_photographs_is_beyond_noise_and_by_the_stars_seen_again():
     """Twenty stars twice, 0.03 mag to either side of their own mean, with noise of 0.02: 0.06^2 / 2
     less 0.02^2; stars seen once tell nothing.
     """
     off_mag = [0.1 * star + sign * 0.03 for star in range(20) for sign in (1, -1)]
     rows = [row(k // 2, off) for k, off in enumerate(off_mag)] + [row(90, 5.0), row(91, -5.0)]
     noise_mag = np.append(np.full(40, 0.02), [9.0, 9.0])
-    part = _scintillation(None, sightings(rows), noise_mag)  # type: ignore[arg-type]
+    session = a_session()
+    part = _scintillation(session, sightings(rows), noise_mag)
     assert part.rms == pytest.approx(math.sqrt(2 * 0.03**2 - 0.02**2))
     assert part.how.endswith("by 20 stars seen again")
-    quiet = _scintillation(None, sightings(rows), 9 * noise_mag)  # type: ignore[arg-type]
-    assert quiet.rms == 0.0
-    monkeypatch.setattr(excess, "_by_law", lambda session: Part(LAW, 0.5, "by law"))
-    few = _scintillation(None, sightings(rows[18:]), noise_mag[18:])  # type: ignore[arg-type]
-    assert few.name == LAW
+    assert _scintillation(session, sightings(rows), 9 * noise_mag).rms == 0.0
+    few = _scintillation(session, sightings(rows[18:]), noise_mag[18:])
+    assert few == _by_law(session) and few.name == LAW
 
 
 def test_what_a_law_says_stays_in_the_rest():
@@ -289,23 +298,20 @@ def test_what_a_law_says_stays_in_the_rest():
 
 
 def test_a_pixel_response_takes_of_a_star_as_its_light_lies_on_pixels():
-    """Half of the light each on two pixels, one to either side of the middle."""
-    share = np.zeros((2 * HALF + 1, 2 * HALF + 1))
-    share[HALF, [HALF - 1, HALF + 1]] = 0.5
-    psf = SimpleNamespace(
-        size_px=(80, 60),
-        core=lambda x_px, y_px, bv: (x_px.tolist(), y_px.tolist()),
-        on_pixels=lambda across, down, core: (np.array([share]), core),
-    )
-    pattern = SimpleNamespace(rms=(0.02, 0.0, 0.0, 0.0))
-    session: Any = SimpleNamespace(psf=psf, pixels=SimpleNamespace(pattern=pattern))
-    assert _response(session) == pytest.approx((0.02 * math.sqrt(0.5), 0.02 * math.sqrt(0.5)))
+    """A Gaussian of 1.5 px, with a pixel's twelfth: the sum of its squares is 1 / 4 pi sigma^2, and
+    that by the square of x 1 / 8 pi, whatever its width.
+    """
+    psf = StarPsf(np.array([[2.25], [2.25], [0.0]]), 0.0, 0.0, 2.0, (80, 60))
+    pattern = FixedPattern((0.02**2, 0.0, 0.0, 0.0), (1e-9,) * 4)
+    session = a_session(psf=psf, pixels=replace(some_pixels(), pattern=pattern))
+    light = 0.02 / math.sqrt(4 * math.pi * (2.25 + 1 / 12))
+    assert _response(session) == pytest.approx((light, 0.02 / math.sqrt(8 * math.pi)), rel=0.01)
 
 
 def test_known_variables_and_doubles_are_told_by_what_the_others_scatter():
     """Sixteen steady stars of 0.1 mag, one double and one variable one of 0.7."""
     rows = [row(k, 0.1 * (-1) ** k) for k in range(16)]
-    rows += [row(20, 0.7, ("double",)), row(21, -0.7, ("variable", "blended"))]
+    rows += [row(20, 0.7, flags=("double",)), row(21, -0.7, flags=("variable", "blended"))]
     part = _variables(sightings(rows))
     whole = (16 * 0.01 + 2 * 0.49) / 18
     assert part.rms == pytest.approx(math.sqrt(whole - 0.01))
@@ -318,22 +324,19 @@ def test_blends_are_other_stars_by_how_far_they_lie_within_a_profile():
     """Two stars, of which one has another of half of its light a pixel aside, with a PSF of one
     pixel: e^(-1/4) of it. The mean is in the zero point.
     """
-    first = SimpleNamespace(
-        star=np.array([1, 7]), x_px=np.array([10.0, 11.0]), y_px=np.zeros(2), dn=np.array([100, 50])
-    )
-    second = SimpleNamespace(
-        star=np.array([2]), x_px=np.array([40.0]), y_px=np.zeros(1), dn=np.array([80.0])
-    )
-    verdicts = [SimpleNamespace(expected=first), SimpleNamespace(expected=second)]
+    first = Expected(np.array([1, 7]), np.array([10.0, 11.0]), np.zeros(2), np.array([100.0, 50.0]))
+    second = Expected(np.array([2]), np.array([40.0]), np.zeros(1), np.array([80.0]))
+    verdicts = [a_verdict(a_shot(0), 0, expected=expected) for expected in (first, second)]
     rows = [
         row(1, x_predicted_px=10.0, y_predicted_px=0.0, dn_predicted=100.0),
         row(2, x_predicted_px=40.0, y_predicted_px=0.0, dn_predicted=80.0),
     ]
-    seen = sightings(rows, verdicts=verdicts, places_px=np.zeros((2, 2)))
-    psf = SimpleNamespace(fwhm_px=lambda x_px, y_px: np.full(len(x_px), 2.3548))
-    session: Any = SimpleNamespace(psf=psf)
+    core_px2 = 1 - 1 / 12  # the pixel has a twelfth
+    psf = StarPsf(np.array([[core_px2], [core_px2], [0.0]]), 0.0, 0.0, 2.0, (80, 60))
     added_mag = MAG_A_RELATIVE * 0.5 * math.exp(-0.25)
-    assert _blends(session, seen).rms == pytest.approx(added_mag / 2, rel=1e-4)
+    blends = _blends(a_session(psf=psf), sightings(rows, verdicts))
+    # a width at half maximum is looked for by hundredths of a pixel
+    assert blends.rms == pytest.approx(added_mag / 2, rel=0.005)
 
 
 def test_a_pattern_of_pixels_is_none_of_lines_of_a_detector_that_is_no_square():

@@ -5,14 +5,16 @@ from __future__ import annotations
 import math
 import tomllib
 from dataclasses import replace
-from types import SimpleNamespace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from astropy.io import fits
 
 from hilstar.instruments.confront import measured_bench
-from hilstar.instruments.confront.background import FixedPattern
+from hilstar.instruments.confront.background import FixedPattern, SkyLevel
+from hilstar.instruments.confront.camera_fit import CameraFit
+from hilstar.instruments.confront.images import Photograph
 from hilstar.instruments.confront.light import NO_CORRECTION, LightFit
 from hilstar.instruments.confront.measured_bench import (
     fixed_camera,
@@ -22,6 +24,7 @@ from hilstar.instruments.confront.measured_bench import (
 from hilstar.instruments.confront.photon_transfer import PixelFit
 from hilstar.instruments.confront.star_psf import StarPsf
 from hilstar.optics.camera import Camera, Lens
+from tests.support.confrontations import a_session, a_shot
 from tests.support.psfs import gaussian, sampled
 
 GIVEN = """
@@ -71,14 +74,15 @@ def session_of(tmp_path, given=GIVEN, *, exposure_s=0.5, t_ns=None, **changed):
     file, has_screen = read_tracker_file(path)
     shots = []
     for name, level_dn in (("a.png", LEVEL_DN - 10), ("b.png", LEVEL_DN + 10)):
-        photo = SimpleNamespace(name=name, t_ns=t_ns, full_dn=FULL_DN, exposure_s=exposure_s)
-        level = SimpleNamespace(level=np.full((4, 4), level_dn))
-        sky = SimpleNamespace(epoch_jyear=2020.1234567, velocity_km_s=np.array([1.0, -29.0, 2.0]))
-        shots.append(SimpleNamespace(photo=photo, level=level, sky=sky))
-    fit = SimpleNamespace(camera=CAMERA, sigma={"k1": 0.0031}, model="focal length and lens")
-    parts = {"file": file, "shots": shots, "camera": fit, "pixels": PIXELS, "psf": PSF}
-    parts |= {"light": LIGHT, "air": None, "power": 1.0, **changed}
-    return SimpleNamespace(**parts), has_screen
+        dn = np.full((4, 4), level_dn)
+        photo = Photograph(Path(name), dn, 1.0, FULL_DN, t_ns, exposure_s=exposure_s)
+        velocity_km_s = np.array([1.0, -29.0, 2.0])
+        shot = replace(a_shot(0), photo=photo, level=SkyLevel(dn, np.ones_like(dn), 16))
+        shot.sky = replace(shot.sky, epoch_jyear=2020.1234567, velocity_km_s=velocity_km_s)
+        shots.append(shot)
+    fit = CameraFit(CAMERA, (), "focal length and lens", {"k1": 0.0031})
+    parts = {"file": file, "shots": tuple(shots), "camera": fit, "pixels": PIXELS, "psf": PSF}
+    return a_session(**(parts | {"light": LIGHT} | changed)), has_screen
 
 
 def written(tmp_path, *args, **changed):
@@ -243,14 +247,8 @@ def test_a_site_is_written_without_its_sky_whose_light_was_measured(tmp_path):
     site = "[site]\nlatitude_deg = 40.0\nlongitude_deg = 10.0\nheight_m = 0\nsky_v_mag_arcsec2 = 20.5\n"
     t_ns = int(np.datetime64("2026-03-20T21:00:00", "ns").astype(np.int64))
     session, _ = session_of(tmp_path, t_ns=t_ns, air=object())
-    given = tomllib.loads(GIVEN + site)
-    text = SimpleNamespace(
-        path=session.file.path, text=GIVEN + site, folder=session.file.folder,
-        config=session.file.config,
-    )  # fmt: skip
-    session.file = text
+    session = replace(session, file=replace(session.file, text=GIVEN + site))
     tables = measured_bench._tables(session, 0.5, True)
     assert tables["site"] == {"latitude_deg": 40.0, "longitude_deg": 10.0, "height_m": 0}
-    assert given["site"]["sky_v_mag_arcsec2"] == 20.5
-    session.air = None
-    assert "site" not in measured_bench._tables(session, 0.5, True)
+    assert tomllib.loads(GIVEN + site)["site"]["sky_v_mag_arcsec2"] == 20.5
+    assert "site" not in measured_bench._tables(replace(session, air=None), 0.5, True)

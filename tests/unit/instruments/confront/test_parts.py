@@ -6,14 +6,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
+from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.instruments.confront import judge
+from hilstar.instruments.confront.camera_fit import Pointing
 from hilstar.instruments.confront.excess import Part, _by_law, _rest, _taken
 from hilstar.instruments.confront.judge import StarRow, defects, light_at
 from hilstar.instruments.confront.light import (
@@ -23,7 +25,7 @@ from hilstar.instruments.confront.light import (
     fit_light,
     with_extinction,
 )
-from hilstar.instruments.confront.session import _apart, _middles, within_image
+from hilstar.instruments.confront.session import Session, _apart, _middles, within_image
 from hilstar.instruments.confront.star_psf import (
     HALF,
     Measured,
@@ -34,6 +36,8 @@ from hilstar.instruments.confront.star_psf import (
     field_terms,
     measure,
 )
+from hilstar.server.bench.bench_file import bench_file_of
+from tests.support.confrontations import TRACKER, a_light, a_session, a_shot, a_star
 
 WIDE_PX, HIGH_PX = SIZE_PX = (640, 480)
 MIDDLE_PX = (319.5, 239.5)  # pixel (0, 0) is the centre of the top-left one
@@ -196,13 +200,11 @@ def test_extinction_is_what_offsets_grow_by_with_an_air_mass(rng):
 
 def test_photographs_of_one_sky_tell_no_pattern_of_the_pixels():
     """The third is of the first one's sky, however far the second is."""
-    off_rad = 20 / 3000  # 20 px of a focal length of 3000 px
-    away = np.array([math.sin(off_rad), 0.0, math.cos(off_rad)])
-    here = np.array([0.0, 0.0, 1.0])
+    off_deg = math.degrees(20 / 3000)  # 20 px of a focal length of 3000 px
     shots = []
-    for boresight in (here, away, here, away):
-        pointing = SimpleNamespace(boresight=boresight)
-        shots.append(SimpleNamespace(pointing=pointing, focal_length_px=3000.0))
+    for ra_deg in (0.0, off_deg, 0.0, off_deg):
+        pointing = Pointing(from_radec_roll_deg(ra_deg, 0.0, 0.0))
+        shots.append(replace(a_shot(0), pointing=pointing, focal_length_px=3000.0))
     assert _apart(shots) == [0, 1]
 
 
@@ -214,28 +216,14 @@ def test_the_light_at_a_place_is_of_its_row_and_column():
 
 
 def row_of(dn: float, **changes) -> StarRow:
-    row = StarRow(
-        star=1,
-        hip=1,
-        name="",
-        x_px=10.5,
-        y_px=20.0,
-        x_predicted_px=10.0,
-        y_predicted_px=20.25,
-        dn=dn,
-        sigma_dn=1.0,
-        dn_predicted=100.0,
-        v_mag=4.0,
-        b_v_mag=0.6,
-        flags=(),
-    )
-    return replace(row, **changes)
+    star = a_star("", 1, 4.0, (10.0, 20.0), dn=dn, dn_predicted=100.0)
+    return replace(star, **changes)
 
 
 def test_a_star_with_less_light_than_predicted_is_fainter():
     row = row_of(50.0)
     assert row.off_mag == pytest.approx(2.5 * math.log10(2))
-    assert row.off_px == (0.5, -0.25)
+    assert row.off_px == (0.25, -0.125)
     assert row.counted
     assert math.isnan(row_of(-3.0).off_mag)
     for change in (
@@ -248,28 +236,33 @@ def test_a_star_with_less_light_than_predicted_is_fainter():
     assert replace(row, flags=("variable",)).counted
 
 
-def session_of(masses, height_m: float | None, exposures_s=(None,)):
-    """What Young's law is asked for: 30 mm, 0.5 s, at a height, and photographs' exposures."""
-    shots = [SimpleNamespace(photo=SimpleNamespace(exposure_s=each)) for each in exposures_s]
-    tracker = SimpleNamespace(aperture_mm=30.0, exposure_s=0.5)
-    site = None if height_m is None else SimpleNamespace(height_m=height_m)
-    config = SimpleNamespace(tracker=tracker, site=site)
-    return SimpleNamespace(
-        file=SimpleNamespace(config=config), light=SimpleNamespace(masses=masses), shots=shots
-    )
+def session_of(
+    masses: tuple[float | None, ...], height_m: float | None, exposures_s=(None,)
+) -> Session:
+    """What Young's law is asked for: 20 mm, 0.2 s, at a height, and photographs' exposures."""
+    shots = []
+    for exposure_s in exposures_s:
+        shot = a_shot(0)
+        shots.append(replace(shot, photo=replace(shot.photo, exposure_s=exposure_s)))
+    site = ""
+    if height_m is not None:
+        site = f"[site]\nlatitude_deg = 5.0\nlongitude_deg = 7.0\nheight_m = {height_m}\n"
+        site += '[sky]\nepoch_utc = "2026-11-21T00:00:00Z"\n'
+    file = bench_file_of(Path("bench.toml"), TRACKER + site)
+    return a_session(file=file, light=replace(a_light(), masses=masses), shots=tuple(shots))
 
 
 @pytest.mark.parametrize(("height_m", "down"), [(None, 1.0), (0.0, 1.0), (8000.0, math.exp(-1))])
 def test_scintillation_by_law_is_youngs_in_magnitudes(height_m, down):
     """Young 1967: 0.09 D^(-2/3) X^1.75 exp(-h / 8 km) / sqrt(2 t) of the light, D in cm."""
     part = _by_law(session_of((1.0, 2.0, None), height_m))
-    relative = 0.09 * 3 ** (-2 / 3) * 1.5**1.75 * down
+    relative = 0.09 * 2 ** (-2 / 3) * 1.5**1.75 * down / math.sqrt(2 * 0.2)
     assert part.rms == pytest.approx(MAG_A_RELATIVE * relative, rel=1e-12)
 
 
 def test_scintillation_is_that_of_the_photographs_exposure_where_they_state_one():
     stated = _by_law(session_of((1.0,), None, exposures_s=(2.0, None, 2.0)))
-    assert stated.rms == pytest.approx(_by_law(session_of((1.0,), None)).rms / 2)
+    assert stated.rms == pytest.approx(_by_law(session_of((1.0,), None)).rms / math.sqrt(10))
     assert "2 s" in stated.how
 
 
@@ -356,11 +349,8 @@ def test_a_catalogue_is_complete_by_the_latitude_s_size(latitude_deg, complete_v
     on_equator /= np.linalg.norm(on_equator)
     latitude = math.radians(latitude_deg)
     boresight = math.sin(latitude) * pole + math.cos(latitude) * on_equator
-    shot = SimpleNamespace(clean=np.zeros(3, dtype=bool))
-    camera = SimpleNamespace(pointings=[SimpleNamespace(boresight=boresight)])
-    judging = SimpleNamespace(session=SimpleNamespace(shots=[shot], camera=camera))
-    fainter = judge.Judge._fainter(judging, 0, None)
-    assert fainter.complete_v_mag == pytest.approx(complete_v_mag, abs=1e-5)  # of the pole's digits
+    found_mag = judge.complete_v_mag(boresight)
+    assert found_mag == pytest.approx(complete_v_mag, abs=1e-5)  # of the pole's digits
 
 
 def test_stars_beyond_a_catalogue_are_those_of_the_counts_less_its_own():

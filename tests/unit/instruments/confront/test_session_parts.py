@@ -7,7 +7,6 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,7 +20,7 @@ from hilstar.instruments.confront import run as confront_run
 from hilstar.instruments.confront import session as sessions
 from hilstar.instruments.confront import star_psf
 from hilstar.instruments.confront.background import FixedPattern, FoundSources, SkyLevel
-from hilstar.instruments.confront.camera_fit import Pointing
+from hilstar.instruments.confront.camera_fit import CameraFit, Pointing
 from hilstar.instruments.confront.images import Photograph, _planes
 from hilstar.instruments.confront.light import LightFit
 from hilstar.instruments.confront.lost_in_space import MIN_MATCHED
@@ -61,7 +60,7 @@ from hilstar.optics.camera import Camera
 from hilstar.server.bench.bench_file import BenchFile, bench_file_of
 from hilstar.sky.catalog import plain_catalog
 from hilstar.sky.spectrum import Curve
-from tests.support.confrontations import a_session, a_shot
+from tests.support.confrontations import a_session, a_shot, seen_shot, sources_at
 from tests.support.planted_sky import rotation_of
 
 TRACKER = """
@@ -126,7 +125,7 @@ def test_a_centre_of_gravity_is_along_its_own_axis():
 
 
 def test_sources_are_from_the_middle_of_the_image():
-    sources = SimpleNamespace(x_px=np.array([399.5, 0.0, 799.0]), y_px=np.array([299.5, 0.0, 9.0]))
+    sources = sources_at([(399.5, 299.5), (0.0, 0.0), (799.0, 9.0)])
     field = _field(sources, np.array([True, True, False]), photograph(np.zeros((600, 800))))
     np.testing.assert_array_equal(field.places_px, [[0.0, 0.0], [-399.5, -299.5]])
     assert (field.width_px, field.height_px) == (800, 600)
@@ -214,12 +213,14 @@ def test_a_fixed_camera_is_that_of_its_file(tmp_path, step_dn):
     assert seen == pytest.approx(variance)
 
 
-def session_of(file: BenchFile, fitted: PixelFit, photo: Photograph, offset_mag: float = 0.0):
-    """As much of a session as the writers of a bench's parts ask for."""
+def session_of(
+    file: BenchFile, fitted: PixelFit, photo: Photograph, offset_mag: float = 0.0
+) -> sessions.Session:
+    """A session of one photograph by a plain camera."""
     light = LightFit(np.full(2, offset_mag), (0.0, 0.0), (0.0, 0.0), 0.0, 0.0, 1.0)
-    shots = (SimpleNamespace(photo=photo),)
-    camera = SimpleNamespace(camera=CAMERA)
-    return SimpleNamespace(file=file, pixels=fitted, shots=shots, light=light, camera=camera)
+    shots = (replace(a_shot(0), photo=photo),)
+    camera = CameraFit(CAMERA, (), "")
+    return a_session(file=file, pixels=fitted, shots=shots, light=light, camera=camera)
 
 
 @pytest.mark.parametrize(("full_dn", "bits"), [(4095.0, 12), (4096.0, 13), (255.0, 8), (65535, 16)])
@@ -316,22 +317,20 @@ def test_stars_that_are_wide_are_out_of_focus_by_their_median():
         check_focus(photo, np.array([WIDE_PX + 0.1, 2.0, 90.0]))
 
 
-def sources_of(length_px: float, width_px: float, trails: int, fwhm_px: float = 3.0):
+def sources_of(
+    length_px: float, width_px: float, trails: int, fwhm_px: float = 3.0
+) -> FoundSources:
     """Twenty sources, of which so many are trails of 80 px."""
-    trail = np.arange(20) < trails
-    return SimpleNamespace(
-        length_px=np.where(trail, 80.0, length_px),
-        width_px=np.full(20, width_px),
-        fwhm_px=np.full(20, fwhm_px),
-        trail=trail,
-    )
+    sources = sources_at([(0.0, 0.0)] * 20, length_px=length_px, width_px=width_px, fwhm_px=fwhm_px)
+    sources.length_px[:trails] = 80.0
+    return sources
 
 
 @pytest.mark.parametrize(
     ("sources", "words"),
     [
         (sources_of(3.0, 2.0, 15), "trails of about 80 px"),
-        (sources_of(40.0, 4.0, 0), "trails of about 40 px"),
+        (sources_of(17.0, 4.0, 0), "trails of about 17 px"),
         (sources_of(40.0, 38.0, 0, 39.0), "sources are 39 px wide"),
         (sources_of(3.0, 2.0, 0), "no part of the sky fits them at 11.4 deg of width"),
     ],
@@ -359,9 +358,9 @@ def test_a_photograph_without_an_attitude_says_what_is_seen(monkeypatch, sources
 
 
 def test_stars_are_first_seen_at_their_sources():
-    sources = SimpleNamespace(x_px=np.array([1.0, 2.0, 3.0]), y_px=np.array([10.0, 20.0, 30.0]))
-    sky = SimpleNamespace(vectors=np.eye(3))
-    shot = SimpleNamespace(sources=sources, sky=sky)
+    shot = a_shot(0)
+    shot.sources = sources_at([(1.0, 10.0), (2.0, 20.0), (3.0, 30.0)])
+    shot.sky = replace(shot.sky, vectors=np.eye(3))
     places = _seen_at(shot, np.array([2, 0]), np.array([1, 2]))
     assert places.x_px.tolist() == [2.0, 3.0]
     assert places.y_px.tolist() == [20.0, 30.0]
@@ -395,20 +394,18 @@ def test_planes_of_a_mosaic_are_every_second_pixel_by_their_letters() -> None:
 
 def test_stars_of_all_photographs_are_in_one_row_each_with_its_image_and_plane() -> None:
     """Of a mosaic's red and second green planes, and of an image of one plane."""
+    stars = {"v_mag": np.array([1.0, 2.0, 3.0]), "bv_mag": np.array([0.1, 0.2, 0.3])}
+    catalog = plain_catalog("HIP", 3, stars | {"ra_deg": np.zeros(3), "dec_deg": np.zeros(3)})
+    sky = DatedSky(catalog, 2020.0, None, np.eye(3), np.arange(3))
     shots = []
     for number, plane in enumerate(("r", "g2", "")):
-        star = np.array([number, 2])
-        found = SimpleNamespace(
-            dn=np.array([10.0, 20.0]) + number,
-            sigma_dn=np.array([1.0, 2.0]) + number,
-            x_px=np.array([410.0, 410.0 + 300 * number]),
-            y_px=np.array([290.0, 690.0]),
-        )
-        sky = SimpleNamespace(v_mag=np.array([1.0, 2.0, 3.0]), bv_mag=np.array([0.1, 0.2, 0.3]))
-        photo = SimpleNamespace(plane=plane)
-        clean = np.array([True, number == 1])
-        shots.append(SimpleNamespace(found=found, sky=sky, photo=photo, star=star, clean=clean))
-    light = _star_light(shots, CAMERA)  # type: ignore[arg-type]
+        places_px = [(410.0, 290.0), (410.0 + 300 * number, 690.0)]
+        shot = seen_shot(places_px, [number, 2], sky=sky, blended=np.array([False, number != 1]))
+        dn, sigma_dn = (number + np.array(values) for values in ((10.0, 20.0), (1.0, 2.0)))
+        shot.measured = replace(shot.found, dn=dn, sigma_dn=sigma_dn)
+        shot.photo = replace(shot.photo, plane=plane)
+        shots.append(shot)
+    light = _star_light(shots, CAMERA)
     assert light.image.tolist() == [0, 0, 1, 1, 2, 2]
     assert light.plane.tolist() == [1, 1, 2, 2, 0, 0]
     assert light.dn.tolist() == [10.0, 20.0, 11.0, 21.0, 12.0, 22.0]

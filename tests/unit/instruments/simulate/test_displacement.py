@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
-from hilstar.instruments.verify.measure import Comparison, fit_geometry
+from hilstar.instruments.verify.measure import fit_geometry, on_detector
 from hilstar.optics.camera import Camera
 
 FOCAL_PX = 1000.0
@@ -85,18 +83,14 @@ def test_what_no_lens_does_is_said_to_be_left(rng):
 
 def test_the_detector_ends_with_its_last_pixels_outer_edges():
     """Of 64 x 48 pixels, whose centres are whole numbers: from -0.5 to 63.5 and 47.5."""
-    comparison = SimpleNamespace(
-        twin=SimpleNamespace(camera=SimpleNamespace(resolution_px=(64, 48)))
-    )
-
-    def on_detector(x_px, y_px, margin_px=0.0):
-        seen = SimpleNamespace(x_px=np.array(x_px), y_px=np.array(y_px))
-        return Comparison._on_detector(comparison, seen, margin_px).tolist()
-
-    assert on_detector([-0.6, -0.5, 63.4, 63.5], [9.0] * 4) == [False, True, True, False]
-    assert on_detector([9.0] * 4, [-0.6, -0.5, 47.4, 47.5]) == [False, True, True, False]
-    assert on_detector([1.4, 1.5, 61.4, 61.6], [9.0] * 4, 2.0) == [False, True, True, False]
-    assert on_detector([np.nan, 9.0], [9.0, np.nan]) == [False, False]
+    for x_px, y_px, margin_px, are_on in (
+        ([-0.6, -0.5, 63.4, 63.5], [9.0] * 4, 0.0, [False, True, True, False]),
+        ([9.0] * 4, [-0.6, -0.5, 47.4, 47.5], 0.0, [False, True, True, False]),
+        ([1.4, 1.5, 61.4, 61.6], [9.0] * 4, 2.0, [False, True, True, False]),
+        ([np.nan, 9.0], [9.0, np.nan], 0.0, [False, False]),
+    ):
+        found = on_detector(np.array(x_px), np.array(y_px), (64, 48), margin_px)
+        assert found.tolist() == are_on
 
 
 def test_what_is_left_is_corrected_for_the_unknowns_and_its_95th_percentile_is_of_places(rng):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 from collections import deque
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,15 +15,15 @@ import hilstar
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.rotation import angle_between_rad, from_radec_roll_deg
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
-from hilstar.instruments.simulate import batch, exposures
+from hilstar.instruments.simulate import batch
 from hilstar.instruments.simulate.exposures import LogFaults, faulty_exposure
 from hilstar.instruments.simulate.pictures import TrackerPictures
 from hilstar.instruments.simulate.simulator import (
-    FaultyExposure,
     FrameNoise,
     Simulator,
     _merge,
     exposure_truth,
+    joined,
     pieces_of,
 )
 from hilstar.optics.layers.fault_kinds import KINDS, Now
@@ -32,7 +31,7 @@ from hilstar.optics.layers.layers import light_of, sky_layers
 from hilstar.optics.layers.truth import TRUTH_DTYPE
 from hilstar.optics.layers.view import STILL, View
 from hilstar.optics.sprites import join_sprites
-from hilstar.server.bench.bench_file import bench_file_of
+from hilstar.server.bench.bench_file import bench_file_of, read_bench_file
 from hilstar.server.bench.cameras import bench_camera, tracker_camera
 from hilstar.server.bench.fault_views import faults_at
 from hilstar.server.bench.scenario import Timetable, parse_scenario
@@ -254,11 +253,9 @@ def dn_of(png):
 
 
 def test_an_exposure_has_the_discs_and_the_capped_stars_of_all_its_pieces():
-    made = object.__new__(FaultyExposure)
     nothing = join_sprites([], 5)
     seen = ((2, ("Moon",)), (0, ()), (3, ("Sun", "Moon")))
-    made._seen = [replace(nothing, capped=capped, discs=discs) for capped, discs in seen]
-    whole = made.sprites()
+    whole = joined([replace(nothing, capped=capped, discs=discs) for capped, discs in seen])
     assert (whole.capped, whole.discs, whole.footprint_px) == (5, ("Moon", "Sun"), 5)
 
 
@@ -285,73 +282,56 @@ def test_each_piece_of_an_exposure_has_its_own_middle_on_the_clock_of_its_view(t
     assert [piece.view.exposure_s for piece in pieces] == pytest.approx([0.02, 0.02, 0.06])
 
 
-def test_faults_of_a_log_count_from_its_first_sample(monkeypatch):
-    """Of a clock that is far from 0; a display that stands still has the log's own attitude."""
-    start_ns, second_ns = 10**15, NS_PER_S
+def test_faults_of_a_log_count_from_its_first_sample(tmp_path):
+    """Of a clock that is far from 0: the display stands still from the first second on, in which it
+    has the log's own attitude.
+    """
+    start_ns = 10**15
     turned = np.array([np.cos(0.1), 0.0, np.sin(0.1), 0.0])
     samples = [
         AttitudeSample(start_ns, np.array([1.0, 0.0, 0.0, 0.0])),
-        AttitudeSample(start_ns + 2 * second_ns, turned),
+        AttitudeSample(start_ns + 2 * NS_PER_S, turned),
     ]
-    asked = []
-    monkeypatch.setattr(exposures, "simulator_view", lambda *_: SimpleNamespace(prepare=None))
-    monkeypatch.setattr(exposures, "Timetable", lambda *parts: parts)
-    monkeypatch.setattr(exposures, "pieces_of", lambda *parts: asked.append(parts) or ())
-    tracker = SimpleNamespace(exposure_s=0.1)
-    simulator = SimpleNamespace(config=SimpleNamespace(tracker=tracker))
-    views = [View.exposure(turned, STILL, 0.1, start_ns + at) for at in (0, second_ns)]
-    assert LogFaults("scenario", samples).pieces(simulator, views) == [(), ()]
-    assert [run_ns for _, run_ns, _, _ in asked] == [0, second_ns]
-    assert asked[0][2][0] == "scenario" and asked[0][2][2] == 0.1
-    attitude_at = asked[0][3]
-    assert attitude_at(2 * second_ns) == pytest.approx(turned)
+    text = '[[fault]]\nkind = "freeze"\nname = "stuck"\nat_s = 1.0\n'
+    scenario = parse_scenario(tmp_path / "faults.toml", text)
+    tracker = {"resolution_px": [64, 48], "exposure_s": 0.1}
+    file = bench_file_of(tmp_path / "bench.toml", bench_text({"tracker": tracker}))
+    views = [View.exposure(turned, STILL, 0.1, start_ns + at) for at in (0, 2 * NS_PER_S)]
+    with Simulator(file) as simulator:
+        moving, standing = LogFaults(scenario, samples).pieces(simulator, views)
+    assert [len(piece.now) for piece in (*moving, *standing)] == [0, 1]
     half = np.array([np.cos(0.05), 0.0, np.sin(0.05), 0.0])
-    assert angle_between_rad(attitude_at(second_ns), half) < 1e-9
+    assert moving[0].view.q_icrs_to_cam == pytest.approx(turned)
+    assert angle_between_rad(standing[0].view.q_icrs_to_cam, half) < 1e-9
 
 
-class Exposing:
-    """A simulator that says what it was asked to expose: 12 bits of one level."""
-
-    def __init__(self):
-        self.asked = []
-        self.config = SimpleNamespace(tracker=SimpleNamespace(detector=SimpleNamespace(bits=12)))
-
-    def view(self, q, rate, t_ns, velocity_km_s, place_km):
-        return View.exposure(q, rate, 0.1, t_ns, velocity_km_s, place_km)
-
-    def expose(self, view, rng, faults):
-        shown = view if faults is None else faults.pieces[0].view
-        self.asked.append((shown, float(rng.normal())))
-        return SimpleNamespace(dn=np.full((2, 3), 0x123, dtype=np.uint16))
-
-
-def test_pictures_of_a_run_have_a_noise_each_and_stand_where_the_display_does():
-    made = object.__new__(TrackerPictures)
-    made._simulator = Exposing()
-    made._noise = FrameNoise("full")
-    made._count = 0
-    made._stood = None
-    made._view = None
+def test_pictures_of_a_run_have_a_noise_each_and_stand_where_the_display_does(tmp_path):
+    """As a simulator has them that is given the noise and the view of each."""
+    tracker = {"resolution_px": [120, 90], "exposure_s": EXPOSURE_S}
+    path = tmp_path / "bench.toml"
+    sky = {"faintest_v_mag": 4.0}
+    path.write_text(
+        bench_text({"tracker": tracker, "sky": sky, "render": {"quantisation": "round"}})
+    )
     frozen = Now(1, KINDS["freeze"](name="stuck"), 0)
     on = []
-    made._now = lambda: tuple(on)
     rate = np.array([0.0, 0.02, 0.0])
     first = AttitudeSample(5, np.array(ORION_Q), rate)
     away = AttitudeSample(9, np.array([0.6, 0.8, 0.0, 0.0]), rate)
-    for sample, faults in ((first, []), (away, [frozen]), (away, [frozen]), (away, [])):
-        on[:] = faults
-        picture = np.asarray(Image.open(io.BytesIO(made(sample))), dtype=np.uint16)
-        assert (picture == 0x1230).all()
-    views = [view for view, _ in made._simulator.asked]
-    for view, sample, is_still in zip(
-        views, (first, first, first, away), (False, True, True, False), strict=True
-    ):
-        np.testing.assert_array_equal(view.q_icrs_to_cam, sample.q_icrs_to_cam)
-        assert view.t_ns == sample.t_ns
-        np.testing.assert_array_equal(view.turn.rate_cam_rad_s, STILL if is_still else rate)
-    noise = [drawn for _, drawn in made._simulator.asked]
-    wanted = [np.random.default_rng((0, number)).normal() for number in range(4)]
-    assert noise == wanted
+    taken = []
+    with hilstar.load(path) as bench:
+        pictures = TrackerPictures(bench, now=lambda: tuple(on))
+        for sample, faults in ((first, []), (away, [frozen]), (away, [frozen]), (away, [])):
+            on[:] = faults
+            taken.append(dn_of(pictures(sample)))
+    with Simulator(read_bench_file(path)) as simulator:
+        moving, still, elsewhere = (
+            simulator.view(q, turn)
+            for q, turn in ((ORION_Q, rate), (ORION_Q, STILL), (away.q_icrs_to_cam, rate))
+        )
+        for number, view in enumerate((moving, still, still, elsewhere)):
+            rng = np.random.default_rng((0, number))
+            np.testing.assert_array_equal(taken[number], simulator.expose(view, rng).dn)
 
 
 def test_a_worker_writes_exposures_each_with_its_number_s_noise_and_how_it_was_made(tmp_path):

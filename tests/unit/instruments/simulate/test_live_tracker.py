@@ -4,8 +4,6 @@ errors that are planted.
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
@@ -34,11 +32,12 @@ from hilstar.instruments.simulate.live_exposure import (
     Solved,
     WatchedFrames,
     _levels_of,
+    smeared_settings,
+    streak_px,
 )
 from hilstar.instruments.simulate.tracker_process import OwnClock, Planted, PlantedErrors
 from hilstar.server.answers.answer import Answer, ReportedStar
 from hilstar.server.bench.bench_file import read_bench_file
-from hilstar.tracker.centroids import Centroids
 from hilstar.tracker.identify import MIN_STARS, FoundStars, Identified
 from tests.support.benches import bench_text
 from tests.support.refusals import refusal
@@ -240,24 +239,10 @@ def test_a_tracker_says_why_it_has_no_attitude(
         ((0.0, 90.0, 0.0), 6.0, False),
     ],
 )
-def test_the_window_is_as_wide_as_an_even_streak(
-    live, monkeypatch, rate_rad_s, window_px, is_still
-):
+def test_the_window_is_as_wide_as_an_even_streak(rate_rad_s, window_px, is_still):
     """Of a tracker whose pixel is a 1000th of a radian, in exposures of a millisecond."""
-    asked = []
-
-    def find(image, settings, background):
-        asked.append(settings)
-        none = np.zeros(0)
-        return Centroids(none, none, none, none, np.zeros(0, np.intp), np.zeros(0, bool))
-
-    monkeypatch.setattr(live_exposure, "find_stars", find)
-    camera = SimpleNamespace(focal_length_px=1000.0, rays=lambda x, y: np.ones((0, 3)))
-    monkeypatch.setattr(live, "camera", camera)
-    monkeypatch.setattr(live, "exposure_s", 1e-3)
-    monkeypatch.setattr(live, "rate_cam_rad_s", lambda: np.array(rate_rad_s))
-    live._found(np.full((48, 64), 100, dtype=np.uint16), solved_at(0, IDENTITY).exposed, None)
-    (settings,) = asked
+    smeared_px = streak_px(np.array(rate_rad_s), 1e-3, 1000.0)
+    settings = smeared_settings(smeared_px, (0.55, 0.55))
     assert settings.window_sigma_px == pytest.approx(window_px)
     assert (settings.psf_sigma_px is not None) == is_still
 

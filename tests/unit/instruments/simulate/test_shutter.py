@@ -4,7 +4,7 @@ display in closed form.
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,14 +16,14 @@ from hilstar.display.render.reference import linear_image
 from hilstar.instruments.campaign.display_tracker import DisplayTracker
 from hilstar.instruments.simulate.shutter import RowBeat, rolled
 from hilstar.instruments.simulate.simulator import Simulator
-from hilstar.instruments.simulate.twin import Twin
+from hilstar.instruments.simulate.twin import Twin, exposure_phase_s
 from hilstar.optics.exposure_motion import Motion
 from hilstar.optics.layers.layers import light_of
 from hilstar.optics.layers.star_layer import StarLayer
 from hilstar.optics.layers.view import Canvas, View
 from hilstar.optics.psf import MAX_CUT, GaussianPsf
 from hilstar.optics.scan import Scan
-from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.bench_file import bench_file_of, read_bench_file
 from hilstar.server.sync import Exposures, seen_at
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import DetectorSettings
@@ -324,13 +324,11 @@ def test_a_triggered_exposure_begins_with_its_frame_and_a_free_one_anywhere_in_i
     """From the middle of an exposure of 30 ms, at 50 Hz."""
 
     def phases_s(trigger: str) -> list[float]:
-        twin = object.__new__(Twin)
-        tracker = SimpleNamespace(trigger=trigger, exposure_s=0.03)
-        monitor = SimpleNamespace(refresh_hz=50.0)
-        twin.config = SimpleNamespace(tracker=tracker, monitor=monitor)
-        return [twin._phase_s(frame) for frame in range(200)]
+        text = bench_text({"tracker": {"trigger": trigger, "exposure_s": 0.03}})
+        tracker = bench_file_of(Path("bench.toml"), text).config.tracker
+        return [exposure_phase_s(tracker, 50.0, frame) for frame in range(200)]
 
-    assert set(phases_s("frame")) == {-0.015}
+    assert set(phases_s("external")) == {-0.015}
     free_s = np.sort(phases_s("free"))
     assert free_s[0] == 0.0 and free_s[-1] < 0.02
     # 200 moments fill a refresh evenly: none is farther from the next than three 200ths of it

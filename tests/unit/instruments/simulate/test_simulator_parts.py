@@ -4,18 +4,28 @@ and how fast it turns at the ends of a log.
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
+from hilstar.attitude.clock.timeline import Policy
+from hilstar.attitude.logs.log_file import log_timeline
+from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.rotation import from_rotation_vector
-from hilstar.instruments.simulate import simulator
+from hilstar.basics.units import NS_PER_S
 from hilstar.instruments.simulate.exposures import view_at
-from hilstar.instruments.simulate.simulator import Simulator, TrackerBackground, full_e
+from hilstar.instruments.simulate.simulator import Simulator, TrackerBackground, full_e, gathered
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.cameras import tracker_camera
+from hilstar.tracker.settings import DetectorSettings
 from tests.support.benches import bench_text
+
+
+def bench(folder, *changes):
+    """A bench of few stars before a small tracker."""
+    path = folder / "bench.toml"
+    small = {"tracker": {"resolution_px": [64, 48]}, "sky": {"faintest_v_mag": 3.0}}
+    path.write_text(bench_text(small, *changes))
+    return read_bench_file(path)
 
 
 @pytest.mark.parametrize(
@@ -29,63 +39,32 @@ from tests.support.benches import bench_text
         ({"background": {"electrons_per_px": 3.0}}, ["tracker"]),
     ],
 )
-def test_what_a_change_of_the_bench_touches_is_made_anew(tmp_path, monkeypatch, tables, made):
-    files = []
-    for name, changes in (("before.toml", {}), ("after.toml", tables)):
-        (tmp_path / name).write_text(bench_text({}, changes))
-        files.append(read_bench_file(tmp_path / name))
-    before, after = files
-    loaded = []
-    target = SimpleNamespace(resolution_px=before.config.tracker.resolution_px, psf="psf")
-    monkeypatch.setattr(simulator, "sky_layers", lambda canvas, sources: ())
-    monkeypatch.setattr(
-        simulator,
-        "Target",
-        lambda resolution_px, psf: SimpleNamespace(resolution_px=resolution_px, psf=psf),
-    )
-    running = SimpleNamespace(
-        config=before.config,
-        file=before,
-        moving=None,
-        canvas=SimpleNamespace(psf="psf"),
-        sources=(),
-        renderer=SimpleNamespace(target=target),
-        _load_sky=lambda: loaded.append("sky"),
-        _load_tracker=lambda: loaded.append("tracker"),
-    )
-    Simulator.change(running, after)
-    assert loaded == made
-    assert running.config is after.config
-    running.moving = "bodies"
-    Simulator.change(running, before)
-    assert loaded[len(made)] == "sky"
-    # what is drawn into is opened anew for another PSF alone
-    closed = []
-    running.renderer = SimpleNamespace(target=target, close=lambda: closed.append(True))
-    monkeypatch.setattr(simulator, "headless_context", lambda gpu: "context")
-    monkeypatch.setattr(simulator, "open_backend", lambda target, context: target.psf)
-    for psf, renderer, times in (("psf", running.renderer, 0), ("wider", "wider", 1)):
-        running.canvas = SimpleNamespace(psf=psf)
-        Simulator.change(running, after if times == 0 else before)
-        assert (running.renderer, len(closed)) == (renderer, times)
+def test_what_a_change_of_the_bench_touches_is_made_anew(tmp_path, tables, made):
+    before, after = (bench(tmp_path, changes) for changes in ({}, tables))
+    with Simulator(before) as simulator:
+        stars, canvas, renderer = simulator.stars, simulator.canvas, simulator.renderer
+        simulator.change(after)
+        anew = {"sky": simulator.stars is not stars, "tracker": simulator.canvas is not canvas}
+        assert [name for name, is_new in anew.items() if is_new] == made
+        assert simulator.config is after.config
+        # what is drawn into is opened anew for another PSF alone
+        assert simulator.renderer is renderer
+        simulator.change(bench(tmp_path, {"tracker": {"psf_sigma_px": [1.5, 1.5]}}))
+        assert simulator.renderer is not renderer
+
+
+def test_a_sky_that_moves_is_made_anew_with_every_change(tmp_path):
+    bodies = {"sky": {"epoch_utc": "2026-11-21T00:00:00Z"}, "sky.bodies": {"planets": True}}
+    with Simulator(bench(tmp_path, bodies)) as simulator:
+        stars = simulator.stars
+        simulator.change(bench(tmp_path, bodies, {"verify": {"flux_mag": 0.2}}))
+        assert simulator.stars is not stars
 
 
 def test_a_detector_without_a_mosaic_gathers_the_glow_of_all_channels():
-    """Three channels of 1, 2 and 4 e-/s over each place, in half a second."""
-    glow = np.array([[1.0, 1.0], [2.0, 2.0], [4.0, 4.0]])
-    air = SimpleNamespace(glow_at=lambda directions, utc_ns: glow)
-    background = SimpleNamespace(
-        _lights=[],
-        _moving=SimpleNamespace(air=air, utc_ns=lambda t_ns: t_ns),
-        _rays=np.eye(3)[:2],
-        _bayer=None,
-        _sr=np.array([1.0, 3.0]),
-        _config=SimpleNamespace(tracker=SimpleNamespace(exposure_s=0.5)),
-        _over_pixels=lambda values: values[None],
-        steady_e=10.0,
-    )
-    view = SimpleNamespace(q_icrs_to_cam=np.array([1.0, 0, 0, 0]), t_ns=0)
-    np.testing.assert_allclose(TrackerBackground.of_view_e(background, view), [[13.5, 20.5]])
+    glow = np.array([[1.0, 1.5], [2.0, 2.5], [4.0, 4.5]])
+    assert gathered(glow, None).tolist() == [[7.0, 8.5]]
+    assert gathered(glow, "rggb") is glow
 
 
 def test_a_pixel_of_a_wide_field_has_its_own_solid_angle_across_and_down(tmp_path):
@@ -110,12 +89,10 @@ def test_a_pixel_of_a_wide_field_has_its_own_solid_angle_across_and_down(tmp_pat
 def test_a_log_s_exposures_turn_as_fast_at_its_ends(t_ns):
     """A second of 0.3 rad/s about the second axis, beyond which nothing turns."""
 
-    def at(time_ns):
-        seconds = min(max(time_ns, 0), 10**9) / 1e9
-        q = from_rotation_vector(np.array([0.0, 0.3 * seconds, 0.0]))
-        return SimpleNamespace(q_icrs_to_cam=q)
-
-    view = view_at(SimpleNamespace(at=at), (0, 10**9), t_ns, 0.1)
+    turned = from_rotation_vector(np.array([0.0, 0.3, 0.0]))
+    samples = [AttitudeSample(0, np.array([1.0, 0, 0, 0])), AttitudeSample(10**9, turned)]
+    timeline = log_timeline(samples, Policy(0, NS_PER_S))
+    view = view_at(timeline, (0, 10**9), t_ns, 0.1)
     assert abs(view.rate_cam_rad_s[1]) == pytest.approx(0.3, rel=1e-6)
     assert view.rate_cam_rad_s[[0, 2]] == pytest.approx([0.0, 0.0], abs=1e-9)
 
@@ -123,5 +100,5 @@ def test_a_log_s_exposures_turn_as_fast_at_its_ends(t_ns):
 @pytest.mark.parametrize(("full_well_e", "full"), [(9_000.0, 8_000.0), (5_000.0, 5_000.0)])
 def test_a_pixel_is_full_by_its_well_or_by_the_adc_above_its_offset(full_well_e, full):
     """Codes to 1023, of which 23 are the offset, of 8 electrons each."""
-    detector = SimpleNamespace(bits=10, offset_dn=23.0, gain_e_per_dn=8.0, full_well_e=full_well_e)
+    detector = DetectorSettings(bits=10, offset_dn=23.0, gain_e_per_dn=8.0, full_well_e=full_well_e)
     assert full_e(detector) == full

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,9 +18,12 @@ from hilstar.instruments.simulate.star_finder import (
 )
 from hilstar.instruments.verify.verdict import median
 from hilstar.optics.psf import GaussianPsf
+from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.build import open_bench
 from hilstar.tracker.centroiders import FAMILY
 from hilstar.tracker.centroids import Centroids, CentroidSettings, LocalBackground
-from hilstar.tracker.settings import DetectorSettings
+from tests.support.benches import bench_text
+from tests.support.spectra import write_channels
 
 # Of a star of sigma 1 px in pixels: a window's S-curve, a box's cut wings.
 BIAS_PX = {"moment": 1e-3, "window": 0.03, "wide": 0.03, "fit": 1e-3, "box3": 0.3, "box5": 0.1}
@@ -35,15 +37,7 @@ def test_a_star_is_crowded_by_the_light_that_others_bring_into_its_window():
     flux = [1.0, 1.0, 1.0, 1.0, 1.0, 1000.0, 1.0]
     assert crowded(
         np.array(place), np.full(7, 50.0), np.array(flux), 4, GaussianPsf((1.0, 1.0))
-    ).tolist() == [
-        True,
-        True,
-        False,
-        False,
-        True,
-        False,
-        False,
-    ]
+    ).tolist() == [True, True, False, False, True, False, False]
 
 
 def test_two_stars_that_are_found_as_one_are_no_two():
@@ -84,30 +78,35 @@ def test_each_centroider_places_stars_where_they_are_also_aside_and_at_the_edge(
 
 
 @pytest.mark.parametrize(("bayer", "least"), [(None, 1.0), ("rggb", 0.25)])
-def test_blobs_begin_at_a_fifth_of_the_faintest_star_s_peak_of_red_in_a_mosaic(bayer, least):
-    """Stars of 50 e-/s that are drawn, and fainter ones that are not; three monitor pixels to one
-    of the tracker.
-    """
-    detector = DetectorSettings(bayer=bayer)
-    config = SimpleNamespace(
-        tracker=SimpleNamespace(exposure_s=0.2, detector=detector),
-        verify=SimpleNamespace(centroider=None),
-    )
-    bench = SimpleNamespace(
-        config=config,
-        psf=SimpleNamespace(width_px=(0.9, 1.2)),
-        tracker_psf=GaussianPsf((0.6, 0.8)),
-        shown_stars=SimpleNamespace(electrons_per_s=np.array([900.0, 3.0, 50.0, 49.0])),
-        faintest_shown_e_per_s=50.0,
-    )
-    finder = star_finder(bench, 3.0)
+def test_blobs_begin_at_a_fifth_of_the_faintest_star_s_peak_of_red_in_a_mosaic(
+    tmp_path, bayer, least
+):
+    """Three monitor pixels to one of the tracker."""
+    tables = {
+        "tracker": {"psf_sigma_px": [0.6, 0.8], "exposure_s": 0.2},
+        "monitor": {"bits": 8},
+        "render": {"sprite_sigma_px": [0.9, 1.2], "quantisation": "round"},
+        "sky": {"faintest_v_mag": 7.0},
+    }
+    if bayer is not None:
+        nm = np.arange(400.0, 701.0, 10.0)
+        curves = {name: np.full_like(nm, 0.5) for name in "rgb"}
+        tables["tracker"] |= write_channels(tmp_path, nm, curves)
+        tables["tracker.detector"] = {"bayer": bayer}
+        tables["render"]["colour"] = "white"
+    path = tmp_path / "bench.toml"
+    path.write_text(bench_text(tables))
+    with open_bench(read_bench_file(path)) as bench:
+        finder = star_finder(bench, 3.0)
+        rates = bench.shown_stars.electrons_per_s
+        faintest_e_per_s = rates[rates >= bench.faintest_shown_e_per_s].min()
     # sampled and shown by squares of a monitor pixel each
     sigma_px = [
         math.sqrt(own**2 + (shown**2 + 2 / 12) / 9) for own, shown in ((0.6, 0.9), (0.8, 1.2))
     ]
     if bayer is None:
         assert finder.psf.width_px == pytest.approx(sigma_px)
-    peak_e = 50.0 * 0.2 * finder.psf.peak_share
+    peak_e = faintest_e_per_s * 0.2 * finder.psf.peak_share
     threshold_e = finder.background.noise * finder.settings.threshold_sigma
     assert threshold_e == pytest.approx(0.2 * least * peak_e)
     assert finder.background.level == 0.0

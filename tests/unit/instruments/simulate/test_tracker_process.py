@@ -22,11 +22,7 @@ from tests.support.fake_clock import FakeClock
 
 LATENCY_S, SILENT_FROM_S, SILENT_S = 0.3, 20.0, 5.0
 PLANTED = Planted(
-    latency_s=LATENCY_S,
-    drift_ppm=50.0,
-    offset_s=2.0,
-    silent_s=SILENT_S,
-    after_s=SILENT_FROM_S,
+    latency_s=LATENCY_S, drift_ppm=50.0, offset_s=2.0, silent_s=SILENT_S, after_s=SILENT_FROM_S
 )
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.special import ndtr
 
+from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.display.geometry import monitor_camera
-from hilstar.display.panel import Panel
-from hilstar.display.quantise import LitLight
-from hilstar.display.response import Response
+from hilstar.display.quantise import shown_light
+from hilstar.display.response import Levels, Response
 from hilstar.instruments.calibrate.effective_psf import _rms
 from hilstar.instruments.compare.sky_comparison import common_motion
 from hilstar.instruments.simulate import twin
 from hilstar.instruments.simulate.star_finder import CROWDED_SHARE, crowded
 from hilstar.optics.psf import GaussianPsf
+from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.build import open_bench
+from tests.support.benches import bench_text
+from tests.support.spectra import bump, write_channels, write_panel
 
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+ORION_Q = from_radec_roll_deg(84.0, -1.2, 0.0)
 
 
 @pytest.mark.parametrize("count", [5, 21, 34, 233])
@@ -33,46 +38,30 @@ def test_exposures_of_a_free_tracker_fill_a_refresh_period_evenly(count):
 
 
 @pytest.mark.parametrize("exposure_s", [0.1, 0.0999, 0.1001])
-def test_an_exposure_is_the_mean_of_its_own_frames(monkeypatch, exposure_s):
-    """Three frames of 1/30 s from frame 7 on; frame n lights its first pixel with n e-/s."""
-    drawn = []
-
-    def draw(sprites, number):
-        drawn.append(number)
-        return SimpleNamespace(levels=number)
-
-    asked = []
-
-    def exposure(before, count):
-        asked.append((before, count))
-        return range(count)
-
-    bench = SimpleNamespace(
-        config=SimpleNamespace(
-            tracker=SimpleNamespace(exposure_s=exposure_s), monitor=SimpleNamespace(refresh_hz=30.0)
-        ),
-        quantiser=SimpleNamespace(exposure=exposure),
-        view=lambda q, rate, t_ns: (q, t_ns),
-        light=lambda view, faults: (view, faults),
-        draw_sprites=draw,
+def test_an_exposure_is_the_mean_of_its_own_frames(tmp_path, exposure_s):
+    """Three frames of 1/30 s from frame 7 on, each with codes of its own, on two panels."""
+    path = tmp_path / "bench.toml"
+    path.write_text(
+        bench_text(
+            {"tracker": {"exposure_s": exposure_s}, "sky": {"faintest_v_mag": 5.0}},
+            {"monitor": {"refresh_hz": 30.0, "bits": 5}, "render": {"quantisation": "temporal"}},
+        )
     )
-
-    class First(int):
-        """The levels of frame 7, of 1 x 2 pixels."""
-
-        shape = (1, 2)
-
-    def lit(levels, panel):
-        return [LitLight(np.array([0]), np.array([panel * float(levels)]))]
-
-    monkeypatch.setattr(twin, "_primaries_lit", lit)
-    frame = SimpleNamespace(levels=First(7), q_icrs_to_cam="q", t_ns=0)
-    panels = twin.exposure_lights(bench, frame, 7, [1.0, 10.0])
-    assert drawn == [8, 9]
-    assert asked == [(7 % twin.PHASES, 3)]
-    for (light,), panel in zip(panels, (1.0, 10.0), strict=True):
-        assert light.place.tolist() == [0]
-        assert light.e_per_s == pytest.approx([8.0 * panel])
+    with open_bench(read_bench_file(path)) as bench:
+        frame = bench.frame(ORION_Q, 7)
+        panels = [bench.panel, replace(bench.panel, flux_at_white_e_per_s=1e9)]
+        exposed = twin.exposure_lights(bench, frame, 7, panels)
+        of_three = bench.quantiser.exposure(7 % twin.PHASES, 3)
+        drawn = []
+        for number in range(of_three.stop):
+            drawn.append(Levels(bench.draw(ORION_Q, 7 + number).levels.copy()))
+    levels = [drawn[number] for number in of_three]
+    assert len(levels) == 3 and any((levels[0] != each).any() for each in levels[1:])
+    for (light,), panel in zip(exposed, panels, strict=True):
+        image = np.zeros(levels[0].size)
+        image[light.place] = light.e_per_s
+        frames = [shown_light(each, panel).ravel() for each in levels]
+        np.testing.assert_allclose(image, np.mean(frames, axis=0), rtol=1e-5)
 
 
 def test_a_true_monitor_s_light_is_in_the_assumed_one_s_order():
@@ -113,12 +102,19 @@ def test_a_common_move_is_told_beyond_what_a_star_may_be_off(rng, move_px, is_to
     assert (motion is not None) == is_told
 
 
-def test_a_tracker_pixel_has_as_many_monitor_pixels_along_a_side_as_their_angles_say():
+def test_a_tracker_pixel_has_as_many_monitor_pixels_along_a_side_as_their_angles_say(tmp_path):
     """Of 100 mm and 50 um, a monitor pixel is 0.5 mrad; of 50 mm and 100 um, a tracker's 2 mrad."""
-    monitor = monitor_camera((640, 480), 50.0, 100.0, UPRIGHT)
-    tracker = monitor_camera((400, 300), 100.0, 50.0, UPRIGHT)
-    cameras = SimpleNamespace(bench=SimpleNamespace(camera=monitor), camera=tracker)
-    assert twin.Twin.monitor_px_per_px.fget(cameras) == pytest.approx(4.0)
+    tables = {
+        "tracker": {"resolution_px": [40, 30], "pixel_pitch_um": 100.0, "focal_length_mm": 50.0},
+        "monitor": {"resolution_px": [64, 48], "pixel_pitch_um": 50.0},
+        "collimator": {"focal_length_mm": 100.0},
+    }
+    path = tmp_path / "bench.toml"
+    path.write_text(
+        bench_text(tables, {"sky": {"faintest_v_mag": 3.0}, "render": {"quantisation": "round"}})
+    )
+    with twin.Twin(read_bench_file(path)) as made:
+        assert made.monitor_px_per_px == pytest.approx(4.0)
 
 
 @pytest.mark.parametrize("times", [0.99, 1.01])
@@ -142,20 +138,24 @@ def test_an_rms_is_the_root_of_the_mean_of_squares():
     assert _rms(np.array([3.0, -4.0, 0.0, 0.0])) == 2.5
 
 
-@pytest.mark.parametrize(("true_e_per_s", "white_e_per_s"), [(None, 100.0), (80.0, 80.0)])
-def test_a_true_white_is_that_of_all_primaries(true_e_per_s, white_e_per_s):
-    response = Response(8, np.array([0.0, 0.4, 1.0]), np.array([0.2, 0.7]))
-    primaries = tuple(Panel(response, white) for white in (30.0, 60.0, 10.0))
-    bench = SimpleNamespace(
-        config=SimpleNamespace(
-            verify=SimpleNamespace(true_flux_at_white_e_per_s=true_e_per_s, true_calibration=None)
-        ),
-        flux_at_white_e_per_s=100.0,
-        panel=Panel(response, 100.0, primaries=primaries),
-        calibration=SimpleNamespace(response=response),
-        uniformity=None,
-    )
-    panel = twin.true_panel(bench)
+@pytest.mark.parametrize("true_e_per_s", [None, 8e4])
+def test_a_true_white_is_that_of_all_primaries(tmp_path, true_e_per_s):
+    nm = np.arange(400.0, 701.0, 10.0)
+    write_panel(tmp_path / "panel.csv", [bump(middle, 30, nm) for middle in (620, 540, 460)], nm)
+    tables = {
+        "tracker": write_channels(tmp_path, nm, {name: np.full_like(nm, 0.5) for name in "rgb"}),
+        "monitor.primaries": {"file": "panel.csv", "layout": "rgb-stripe"},
+        "render": {"colour": "star", "quantisation": "round", "flux_at_white_e_per_s": 1e5},
+        "verify": {"true_flux_at_white_e_per_s": true_e_per_s},
+        "sky": {"faintest_v_mag": 3.0},
+    }
+    path = tmp_path / "bench.toml"
+    path.write_text(bench_text(tables))
+    with open_bench(read_bench_file(path)) as bench:
+        panel = twin.true_panel(bench)
+        assumed = [primary.flux_at_white_e_per_s for primary in bench.panel.primaries]
+    white_e_per_s = true_e_per_s or 1e5
     assert panel.flux_at_white_e_per_s == white_e_per_s
     parts = [primary.flux_at_white_e_per_s for primary in panel.primaries]
-    assert parts == pytest.approx([share * white_e_per_s for share in (0.3, 0.6, 0.1)])
+    assert sum(parts) == pytest.approx(white_e_per_s)
+    assert parts == pytest.approx([white_e_per_s / 1e5 * part for part in assumed])

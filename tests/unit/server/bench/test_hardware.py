@@ -4,10 +4,12 @@ and limits from both sides.
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
+from hilstar.server.bench.config import AttitudeSettings, parse_config
 from hilstar.server.bench.config.hardware import (
     Monitor,
     PrimariesSettings,
@@ -18,10 +20,11 @@ from hilstar.server.bench.config.hardware import (
     check_primaries,
     check_sync,
 )
+from tests.support.benches import SMALL_BENCH
 from tests.support.refusals import refusal
 
-SERIAL = SimpleNamespace(source="serial", port="/dev/ttyUSB1")
-TRACKER = SimpleNamespace(frame_hz=None, exposure_s=0.1)
+SERIAL = AttitudeSettings(source="serial", port="/dev/ttyUSB1")
+TRACKER = replace(parse_config(Path("bench.toml"), SMALL_BENCH).tracker, exposure_s=0.1)
 
 
 @pytest.mark.parametrize(
@@ -68,7 +71,7 @@ def test_a_lens_is_warmer_by_what_its_temperature_is_above_its_reference():
     ("frame_hz", "is_refused"), [(10.0, False), (10.000009, False), (10.0001, True)]
 )
 def test_exposures_may_follow_one_another_but_not_overlap(frame_hz, is_refused):
-    tracker = SimpleNamespace(frame_hz=frame_hz, exposure_s=0.1)
+    tracker = replace(TRACKER, frame_hz=frame_hz)
     monitor = Monitor(resolution_px=(320, 240), pixel_pitch_um=50.0)
     if is_refused:
         said = refusal(check_sync, SyncSettings(), tracker, monitor, SERIAL)
@@ -106,8 +109,8 @@ def test_a_pulse_ends_before_the_next(pulse_ms, every, words):
 )
 def test_a_tracker_has_one_efficiency_or_all_three(given, bayer, words):
     efficiencies = {f"quantum_efficiency{end}": 0.5 for end in given.split()}
-    detector = SimpleNamespace(bayer=bayer)
-    tracker = SimpleNamespace(quantum_efficiencies=efficiencies, detector=detector)
+    detector = replace(TRACKER.detector, bayer=bayer)
+    tracker = replace(TRACKER, detector=detector, **({"quantum_efficiency": None} | efficiencies))
     if words is None:
         check_channels(tracker)
     else:
@@ -115,7 +118,5 @@ def test_a_tracker_has_one_efficiency_or_all_three(given, bayer, words):
 
 
 def test_one_efficiency_and_one_of_a_colour_are_refused():
-    efficiencies = {"quantum_efficiency": 0.5, "quantum_efficiency_g": 0.5}
-    detector = SimpleNamespace(bayer=None)
-    tracker = SimpleNamespace(quantum_efficiencies=efficiencies, detector=detector)
+    tracker = replace(TRACKER, quantum_efficiency=0.5, quantum_efficiency_g=0.5)
     assert "quantum_efficiency and quantum_efficiency_g" in refusal(check_channels, tracker)

@@ -5,19 +5,20 @@ within the tolerance, and what each choice adds to the worst errors of all.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from hilstar.basics.errors import InputError
+from hilstar.optics.psf import GaussianPsf
 from hilstar.optics.scan import Orientation
 from hilstar.server.bench import scene as scenes
 from hilstar.server.bench.bench_file import BenchFile, bench_file_of
 from hilstar.server.bench.cameras import bench_camera
 from hilstar.server.bench.code_errors import CodeErrors
+from hilstar.server.bench.config import RenderSettings
 from hilstar.server.bench.effort import FieldCost, Motion, Sides, exact_in_time
 from hilstar.server.bench.least_psf import WHOLE, Choice
 from hilstar.server.bench.monitor import orientation_of, scan_of
@@ -28,7 +29,9 @@ from hilstar.server.bench.scene import (
     turning_of,
     white_of,
 )
+from hilstar.sky.stars import Stars
 from tests.support.benches import bench_text
+from tests.support.stars import stars_at
 
 PITCH_UM, COLLIMATOR_MM = 57.65, 60.0  # of the small bench
 
@@ -74,19 +77,13 @@ def test_a_monitor_s_rows_light_as_its_keys_say_or_for_a_refresh(tmp_path):
     assert orientation_of(bench_file(tmp_path).config.monitor) == Orientation()
 
 
-PSF: Any = SimpleNamespace(peak_share=0.25)
+PSF = GaussianPsf((0.85, 0.85))
 
 
-class Lit(SimpleNamespace):
-    """Stars of these magnitudes and rates."""
-
-    def __len__(self) -> int:
-        return len(self.v_mag)
-
-
-def lit(v_mag: list[float], rates: list[float]) -> Any:
-    """Stars."""
-    return Lit(v_mag=np.array(v_mag), electrons_per_s=np.array(rates))
+def lit(v_mag: list[float], rates: list[float]) -> Stars:
+    """Stars of these magnitudes and rates, wherever they are."""
+    stars = stars_at(np.tile([1.0, 0.0, 0.0], (len(rates), 1)), np.array(rates))
+    return replace(stars, v_mag=np.array(v_mag, np.float32))
 
 
 EVERY = lit([-1.4, 0.0, 0.5, 2.0], [900.0, 250.0, 160.0, 40.0])
@@ -108,14 +105,12 @@ EVERY = lit([-1.4, 0.0, 0.5, 2.0], [900.0, 250.0, 160.0, 40.0])
 def test_full_scale_is_the_brightest_pixel_of_the_brightest_star_from_a_magnitude_on(
     stars, brightest_v_mag, drive, peak
 ):
-    assert brightest_peak_e_per_s(stars, PSF, brightest_v_mag, drive) == peak * 0.25
+    assert brightest_peak_e_per_s(stars, PSF, brightest_v_mag, drive) == peak * PSF.peak_share
 
 
 def test_full_scale_that_the_file_gives_is_its_own():
-    render: Any = SimpleNamespace(flux_at_white_e_per_s=77.0, brightest_v_mag=None)
-    assert white_of(render, EVERY, PSF) == 77.0
-    render.flux_at_white_e_per_s = None
-    assert white_of(render, EVERY, PSF) == 10.0
+    assert white_of(RenderSettings(flux_at_white_e_per_s=77.0), EVERY, PSF) == 77.0
+    assert white_of(RenderSettings(), EVERY, PSF) == 40.0 * PSF.peak_share
 
 
 @pytest.mark.parametrize(
@@ -123,8 +118,8 @@ def test_full_scale_that_the_file_gives_is_its_own():
     [
         (EVERY, 2.5, r"\[render\] brightest_v_mag leaves no star; write a smaller"),
         (lit([], []), 0.0, r"\[sky\] faintest_v_mag leaves no star; write a larger"),
-        (lit([1.0], [1e-9]), 0.0, r"the brightest star to show gives 2.5e-10 electrons"),
-        (lit([1.0], [1e13]), 0.0, r"the brightest star to show gives 2.5e\+12 electrons"),
+        (lit([1.0], [1e-9]), 0.0, r"the brightest star to show gives 1.97e-10 electrons"),
+        (lit([1.0], [1e13]), 0.0, r"the brightest star to show gives 1.97e\+12 electrons"),
     ],
 )
 def test_a_full_scale_of_no_star_or_beyond_numbers_is_refused(stars, brightest_v_mag, words):
@@ -140,7 +135,7 @@ class Planned:
     number: int
 
 
-TOLERANCE: Any = SimpleNamespace(tolerance_mag=0.02, tolerance_px=0.03)
+TOLERANCE = RenderSettings(tolerance_mag=0.02, tolerance_px=0.03)
 
 
 @pytest.mark.parametrize(

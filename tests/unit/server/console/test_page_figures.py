@@ -7,11 +7,11 @@ from __future__ import annotations
 import re
 import types
 import typing
-from types import SimpleNamespace
 
 import msgspec
 import pytest
 
+from hilstar.attitude.receiver import PacketCounts
 from hilstar.server.console.page_figures import (
     COUNTS,
     FIGURES,
@@ -30,12 +30,20 @@ from hilstar.server.console.protocol import (
     SkyHealth,
 )
 from hilstar.server.console.report import PAGE_DIR
+from hilstar.server.summary import RunTally
 
 SCRIPT = (PAGE_DIR / "figures.js").read_text(encoding="utf-8")
 OTHER_KEYS = re.compile(r"\{([\w.]+)(?: [^}]+)?\}")
-TALLY = SimpleNamespace(frames=600, missed_frames=5, stale_frames=4, given_up_frames=3)
-PACKETS = SimpleNamespace(received=90, refused=8, lost=2, refused_by={"crc": 8, "nan": 0})
-RUN = SimpleNamespace(loop=SimpleNamespace(tally=TALLY), packets=PACKETS)
+
+
+def run_counts() -> RunCounts:
+    """The counts of a run of 600 frames and 90 packets."""
+    tally, packets = RunTally(), PacketCounts(received=90, lost=2)
+    for _ in range(600):
+        tally.add(1, 1, 31, ())
+    tally.missed_frames, tally.stale_frames, tally.given_up_frames = 5, 4, 3
+    packets.refused_by["crc"] = 8
+    return counts_of(tally, packets)
 
 
 def leads_to_a_field(key: str) -> bool:
@@ -78,7 +86,7 @@ def test_names_stand_once_in_a_panel_and_keys_once_in_the_table() -> None:
 def test_every_count_of_a_run_has_a_row_that_says_where_it_comes_from() -> None:
     counted = {figure.key for figure in FIGURES if figure.source is not None}
     assert counted == {f"{COUNTS}{name}" for name in RunCounts.__struct_fields__}
-    assert counts_of(RUN) == RunCounts(
+    assert run_counts() == RunCounts(
         frames=600, missed=5, stale=4, given_up=3, received=90, accepted=82, lost=2,
         refused={"crc": 8},
     )  # fmt: skip
@@ -90,7 +98,7 @@ def test_metrics_are_the_figures_in_units_of_openmetrics() -> None:
         health=SkyHealth(True, "", []),
         source=AttitudeSource("udp", ""),
         pacing=None,
-        counts=counts_of(RUN),
+        counts=run_counts(),
         ledger=LedgerState("run.mcap", 4096),
     )
     found = {metric.name: (value, metric.kind) for metric, value in metrics_of(state)}

@@ -6,7 +6,9 @@ from __future__ import annotations
 
 import math
 import threading
+from dataclasses import replace
 from datetime import UTC, datetime
+from pathlib import Path
 from types import SimpleNamespace
 
 import msgspec
@@ -22,10 +24,14 @@ from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.basics.wrong_sky import ENDS, RATES
 from hilstar.display.render.aids import GRID
-from hilstar.server.answers.answer import ReportedStar
-from hilstar.server.answers.judge import TrackerFigures
+from hilstar.instruments.calibrate.first_light.image_sources import Pattern
+from hilstar.server.answers.answer import Answer, ReportedStar
+from hilstar.server.answers.judge import Judged, TrackerFigures
+from hilstar.server.answers.pairing import Lit
 from hilstar.server.bench.bench_file import bench_file_of
+from hilstar.server.bench.scenario import FaultSchedule, parse_scenario
 from hilstar.server.console import publisher
+from hilstar.server.console.listener import ListenAddress, PageListener
 from hilstar.server.console.messages import (
     FRAME,
     PICTURE,
@@ -59,17 +65,23 @@ from hilstar.server.console.publisher import (
     names_of,
     setup_for,
 )
-from hilstar.server.operator import GAMMA, Aids, OnScreen, SwitchRequests
+from hilstar.server.operator import GAMMA, OnScreen, SwitchRequests
 from hilstar.server.pacer import Shown
 from hilstar.server.pointing import POINTING
-from hilstar.server.record.ledger import LedgerSwitch
+from hilstar.server.record.ledger import Ledger, LedgerSwitch
 from hilstar.server.record.ledger_records import MAX_CENTROIDS
-from hilstar.server.summary import RunTally
+from hilstar.server.run_progress import Running
+from hilstar.server.screen.screen import Screen
 from tests.support.benches import bench_text
+from tests.support.drawn import drawn, stars_at
+from tests.support.full_disk import files_of_at_most
+from tests.support.model_display import model_screen
+from tests.support.queued_answers import unasked_answers
+from tests.support.waiting import wait_for
 
 WIDTH, HEIGHT = 6, 4
 Q = from_radec_roll_deg(84.057, -1.2, 30.0)
-DRAWN = SimpleNamespace(levels=np.zeros((HEIGHT, WIDTH), np.uint8), sprites=None)
+DRAWN = drawn(np.zeros((HEIGHT, WIDTH), np.uint8))
 TURNING = Attitude(
     Q, 7_500_000, False, rate_cam_rad_s=np.array([math.pi / 180, 0.0, -math.pi / 360])
 )
@@ -81,14 +93,21 @@ def memory() -> SharedMemory:
 
 
 @pytest.fixture
-def feed(memory) -> FramePublisher:
+def running(loop, small_bench) -> Running:
+    """A run of which 3 frames were missed, with 9 packets and a tracker."""
+    tally = loop.tally
+    tally.missed_frames, tally.stale_frames, tally.given_up_frames = 3, 2, 1
+    packets = PacketCounts(received=9, lost=4)
+    packets.refused_by["crc"] = 2
+    clock = ClockSummary("exchange", offset_ms=-5.5, drift_ppm=12.0, uncertainty_ms=0.25)
+    answers = unasked_answers(small_bench.config.monitor)
+    return Running(loop, packets, lambda: clock, answers)
+
+
+@pytest.fixture
+def feed(memory, running) -> FramePublisher:
     published = FramePublisher(memory)
-    tally = RunTally()
-    tally.missed_frames = 3
-    counts = PacketCounts(received=9)
-    counts.refused_by["crc"] = 2
-    loop = SimpleNamespace(tally=tally)
-    published.follow(SimpleNamespace(loop=loop, packets=counts, answers=None))
+    published.follow(running)
     return published
 
 
@@ -129,12 +148,12 @@ def test_each_frame_is_published_with_its_numbers(memory, feed):
 
 def test_pictures_are_copied_while_somebody_wants_them_and_ten_times_a_second_at_most(memory, feed):
     levels = np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH)
-    drawn = SimpleNamespace(levels=levels, sprites=None)
+    copied = drawn(levels)
 
     def pictures(from_ms: int, to_ms: int) -> int:
         before = memory.pictures.newest
         for at_ms in range(from_ms, to_ms, 10):
-            feed.see(Shown(at_ms, 5, TURNING, drawn, swap_ns=at_ms * NS_PER_MS))
+            feed.see(Shown(at_ms, 5, TURNING, copied, swap_ns=at_ms * NS_PER_MS))
         return memory.pictures.newest - before
 
     assert pictures(0, 1000) == 0
@@ -153,14 +172,9 @@ def test_pictures_are_copied_while_somebody_wants_them_and_ten_times_a_second_at
 def test_a_coloured_picture_is_grey_by_its_brightest_channel_and_has_its_stars(memory, feed):
     levels = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     levels[1, 2] = (4, 90, 7)
-    sprites = SimpleNamespace(
-        data={"electrons_per_s": np.array([5.0, 6.0])},
-        star=np.array([11, 12]),
-        x_px=np.array([2.25, 4.5]),
-        y_px=np.array([1.0, 3.0]),
-    )
+    sprites = stars_at([2.25, 4.5], [1.0, 3.0], [11, 12])
     memory.want = PictureRequest(1, NS_PER_S)
-    feed.see(Shown(0, 0, None, SimpleNamespace(levels=levels, sprites=sprites), swap_ns=5))
+    feed.see(Shown(0, 0, None, drawn(levels, sprites), swap_ns=5))
     data = memory.pictures.last()[1]
     grey = np.frombuffer(data, np.uint8, WIDTH * HEIGHT, PICTURE_HEAD_BYTES)
     assert grey.reshape(HEIGHT, WIDTH)[1, 2] == 90
@@ -170,36 +184,24 @@ def test_a_coloured_picture_is_grey_by_its_brightest_channel_and_has_its_stars(m
     assert (stars["x_px"].tolist(), stars["y_px"].tolist()) == ([2.25, 4.5], [1.0, 3.0])
 
 
-class Faults:
-    """A scenario's faults by name, and what was asked of them."""
-
-    def __init__(self) -> None:
-        self.asked: list[tuple[str, str, str]] = []
-
-    def names(self) -> list[str]:
-        return ["stray", "hot"]
-
-    def start(self, name: str, who: str) -> None:
-        self.asked.append(("start", name, who))
-
-    def stop(self, name: str, who: str) -> None:
-        self.asked.append(("stop", name, who))
+SCENARIO = "".join(f'[[fault]]\nkind = "blank"\nname = "{name}"\n' for name in ("stray", "hot"))
 
 
-class KeptLedger:
-    """A ledger at a path, which fails where it is told to."""
+def parts_of(bench, make_ledger=None, **parts) -> PageParts:
+    """The parts of a run of a bench, whose scenario has two faults."""
+    notices = Notices()
+    faults = FaultSchedule(parse_scenario(Path("scenario.toml"), SCENARIO))
 
-    def __init__(self, path, failure=None) -> None:
-        self.path, self.failure = path, failure
-        self.closed = False
+    def ledger(path: Path) -> Ledger:
+        return Ledger(path, bench, notices)
 
-    def close(self) -> None:
-        self.closed = True
+    known = {"faults": faults} | parts
+    return PageParts(bench, notices, LedgerSwitch(), make_ledger or ledger, **known)
 
 
 @pytest.fixture
-def parts() -> PageParts:
-    return PageParts(None, Notices(), LedgerSwitch(), KeptLedger, faults=Faults())
+def parts(small_bench) -> PageParts:
+    return parts_of(small_bench)
 
 
 @pytest.fixture
@@ -272,50 +274,55 @@ def test_a_ledger_is_begun_once_and_ended_with_what_became_of_it(orders, tmp_pat
     assert orders.notices.counts()["operator"] == 2
 
 
-def test_a_ledger_that_failed_or_cannot_be_made_is_no_success(feed, tmp_path, monkeypatch):
+def test_a_ledger_that_failed_or_cannot_be_made_is_no_success(
+    feed, parts, small_bench, tmp_path, monkeypatch
+):
     def failing(path):
         raise InputError(f"{path}: cannot be written")
 
     monkeypatch.chdir(tmp_path)
-    failed = PageParts(None, Notices(), LedgerSwitch(), lambda path: KeptLedger(path, "disk full"))
-    unmade = PageParts(None, Notices(), LedgerSwitch(), failing)
-    handlers = [OrderHandler(SwitchRequests(), feed, parts) for parts in (failed, unmade)]
     on, off = (Order(id=1, name="ledger", who="ann", on=is_on) for is_on in (True, False))
-    assert handlers[0].do(on).status == 200
-    ended = handlers[0].do(off)
-    assert (ended.status, ended.line.endswith("disk full")) == (500, True)
-    assert handlers[1].do(on).status == 409
+    handler = OrderHandler(SwitchRequests(), feed, parts)
+    assert handler.do(on).status == 200
+    with files_of_at_most(parts.ledger.current.size_bytes + 1):
+        ended = handler.do(off)
+    assert (ended.status, ended.line.endswith("File too large")) == (500, True)
+    unmade = OrderHandler(SwitchRequests(), feed, parts_of(small_bench, failing))
+    assert unmade.do(on).status == 409
 
 
 def test_a_fault_is_on_once_two_more_frames_have_been_drawn(orders, feed, parts):
     """The next one may have been in drawing when it was asked for."""
-    feed.see(Shown(0, 0, None, DRAWN))
-    status, line = orders.do("fault", fault="hot")
-    assert (status, "no frame was drawn" in line) == (504, True)
-    faults = parts.faults
 
-    def draw(frames: int):
-        def start(name: str, who: str) -> None:
-            faults.asked.append(("start", name, who))
+    def draw(frames: int) -> threading.Thread:
+        """Frames that are drawn once a fault has been asked for."""
+
+        def see() -> None:
+            wait_for(parts.faults.on, poll_s=0.001)
             for number in range(frames):
                 feed.see(Shown(number, 0, None, DRAWN))
 
-        return start
+        drawing = threading.Thread(target=see)
+        drawing.start()
+        return drawing
 
-    faults.start = draw(1)
-    assert orders.do("fault", fault="hot")[0] == 504
-    faults.start = draw(2)
-    assert orders.do("fault", fault="hot") == (200, "fault hot on")
+    feed.see(Shown(0, 0, None, DRAWN))
+    for frames, wanted in ((0, 504), (1, 504), (2, 200)):
+        drawing = draw(frames)
+        status, line = orders.do("fault", fault="hot")
+        drawing.join()
+        assert status == wanted
+        parts.faults.stop("hot")
+    assert line == "fault hot on"
     assert orders.do("fault", fault="hott") == (
         404,
         "no fault of that name; did you mean hot? write one of stray, hot",
     )
-    assert [verb for verb, _, _ in faults.asked] == ["start"] * 3
+    assert orders.do("fault", fault="hot", on=False) == (409, "the fault 'hot' is not on; none is")
 
 
-def test_a_run_without_faults_has_none_to_start(feed):
-    parts = PageParts(None, Notices(), LedgerSwitch(), KeptLedger)
-    handler = OrderHandler(SwitchRequests(), feed, parts)
+def test_a_run_without_faults_has_none_to_start(feed, small_bench):
+    handler = OrderHandler(SwitchRequests(), feed, parts_of(small_bench, faults=None))
     assert handler.do(Order(id=1, name="fault", who="ann", fault="hot")).status == 409
 
 
@@ -337,8 +344,8 @@ def test_a_session_shows_what_fits_and_takes_marks_alone(memory):
     session.notices.listen(lambda notice: told.append((notice.kind, notice.detail)))
     codes = np.zeros((HEIGHT, WIDTH, 3), np.uint16)
     codes[2, 1] = (300, 20, 900)
-    session.show(SimpleNamespace(name="red", codes=codes))
-    session.show(SimpleNamespace(name="huge", codes=np.zeros((4000, 4000), np.uint16)))
+    session.show(Pattern("red", codes))
+    session.show(Pattern("huge", np.zeros((4000, 4000), np.uint16)))
     assert told == [("pattern", "shows red")]
     assert session.now().frame.number == 1
     data = memory.pictures.last()[1]
@@ -354,9 +361,9 @@ def test_a_session_shows_a_picture_that_just_fits_and_none_of_a_byte_more(memory
     session, told = SessionPublisher(memory), []
     session.notices.listen(lambda notice: told.append(notice.detail))
     room = memory.pictures.slot_bytes - PICTURE_HEAD_BYTES
-    session.show(SimpleNamespace(name="over", codes=np.zeros((1, room + 1), np.uint8)))
+    session.show(Pattern("over", np.zeros((1, room + 1), np.uint8)))
     assert (told, memory.pictures.newest) == ([], 0)
-    session.show(SimpleNamespace(name="just", codes=np.zeros((1, room), np.uint8)))
+    session.show(Pattern("just", np.zeros((1, room), np.uint8)))
     assert (told, memory.pictures.newest) == (["shows just"], 1)
 
 
@@ -381,39 +388,27 @@ def test_names_are_those_of_the_brightest_stars_without_a_hip_number(monkeypatch
     assert names_of(stars) == {2: "star 2", 5: "star 5"}
 
 
-def watched_run(feed, tmp_path, **parts) -> WatchedRun:
-    """What a page's process is told of a run whose clock, ledger, screen and faults are stated."""
-    aids = Aids()
-    aids.toggle("grid")
-    watch = SimpleNamespace(alive_ns=4321)
-    pacer = SimpleNamespace(operator=SimpleNamespace(aids=aids))
-    tally = RunTally()
-    tally.missed_frames, tally.stale_frames, tally.given_up_frames = 3, 2, 1
-    tally.first_swap_ns = 0
-    counts = PacketCounts(received=9, lost=4)
-    counts.refused_by["crc"] = 2
-    clock = ClockSummary("exchange", offset_ms=-5.5, drift_ppm=12.0, uncertainty_ms=0.25)
-    figures, widths = TrackerFigures(right=8), SimpleNamespace(state=None)
-    answers = SimpleNamespace(figures=figures, widths=widths, newest=None)
-    loop = SimpleNamespace(tally=tally, watch=watch, pacer=pacer)
-    feed.follow(SimpleNamespace(loop=loop, packets=counts, clock=lambda: clock, answers=answers))
-    ledger = SimpleNamespace(path=tmp_path / "run.mcap", size_bytes=77)
-    known = {
-        "bench": None,
-        "notices": Notices(),
-        "ledger": SimpleNamespace(current=ledger),
-        "make_ledger": None,
-        "screen": SimpleNamespace(window=SimpleNamespace(gone=None), forced=["a", "b"]),
-        "faults": SimpleNamespace(on=lambda: ["flash"]),
-    }
-    return WatchedRun(feed, PageParts(**(known | parts)))
+def screen_of(folder: Path, gone: str | None = None, forced: tuple[str, ...] = ()) -> Screen:
+    """The small bench's screen on a model display."""
+    screen, _ = model_screen(folder, gone=gone)
+    screen.forced = list(forced)
+    return screen
 
 
-def test_the_state_of_a_run_has_what_each_of_its_parts_says(feed, tmp_path):
-    run = watched_run(feed, tmp_path)
-    drawn = SimpleNamespace(star_count=31, clipped_hip=tuple(range(MAX_CLIPPED + 5)), sprites=None)
-    feed.see(Shown(70, 0, TURNING, drawn, stale=True, on_screen=OnScreen("grid", "covered")))
-    state = run.now()
+def test_the_state_of_a_run_has_what_each_of_its_parts_says(feed, running, parts, tmp_path):
+    running.loop.watch.alive_ns = 4321
+    running.loop.pacer.operator.aids.toggle("grid")
+    running.loop.tally.first_swap_ns = 0
+    running.answers.figures = TrackerFigures(right=8)
+    parts = replace(parts, screen=screen_of(tmp_path, forced=("a", "b")))
+    parts.faults.start("stray", "ann")
+    run = WatchedRun(feed, parts)
+    levels = np.zeros((HEIGHT, WIDTH), np.uint8)
+    frame = drawn(levels, stars_at(range(31), range(31)), tuple(range(MAX_CLIPPED + 5)))
+    feed.see(Shown(70, 0, TURNING, frame, stale=True, on_screen=OnScreen("grid", "covered")))
+    ledger = parts.ledger.begin(lambda: parts.make_ledger(tmp_path / "run.mcap"))
+    state, size_bytes = run.now(), ledger.size_bytes
+    parts.ledger.end()
     assert (state.alive_ns, state.overlay, state.operator_text) == (4321, GRID, "grid")
     assert state.operator["grid"] and not state.operator["blank"]
     frame = state.frame
@@ -427,17 +422,18 @@ def test_the_state_of_a_run_has_what_each_of_its_parts_says(feed, tmp_path):
     assert (counts.missed, counts.stale, counts.given_up) == (3, 2, 1)
     assert (counts.received, counts.accepted, counts.lost) == (9, 7, 4)
     assert counts.refused == {"crc": 2}
-    assert (state.hidden, state.forced, state.faults) == ("covered", "a; b", ["flash"])
+    assert (state.hidden, state.forced, state.faults) == ("covered", "a; b", ["stray"])
     assert (state.display_lost, state.gamma, state.pointing) == ("", "", "")
-    assert state.ledger == LedgerState(str(tmp_path / "run.mcap"), 77)
+    assert state.ledger == LedgerState(str(ledger.path), size_bytes) and size_bytes
     assert state.tracker == TrackerFigures(right=8)
     assert (state.wrong_sky, state.wrong_sky_s) == ([], 0.0)
 
 
-def test_what_is_wrong_with_a_run_stays_in_its_state_while_it_lasts(feed, tmp_path):
-    notices = Notices()
-    gone = SimpleNamespace(window=SimpleNamespace(gone="the window went away"), forced=[])
-    run = watched_run(feed, tmp_path, notices=notices, screen=gone)
+def test_what_is_wrong_with_a_run_stays_in_its_state_while_it_lasts(feed, running, parts, tmp_path):
+    running.loop.tally.first_swap_ns = 0
+    notices = parts.notices
+    run = WatchedRun(feed, replace(parts, screen=screen_of(tmp_path, "the window went away")))
+    parts.ledger.begin(lambda: parts.make_ledger(tmp_path / "run.mcap"))
     notices.begin(GAMMA, "the ramp is bent")
     notices.begin(POINTING, "points at Orion")
     notices.begin(RATES, "twice as fast")
@@ -453,30 +449,30 @@ def test_what_is_wrong_with_a_run_stays_in_its_state_while_it_lasts(feed, tmp_pa
     notices.end(GAMMA, "gamma-straight", "")
     notices.end(RATES, ENDS[RATES], "")
     state = run.now()
+    parts.ledger.end()
     assert (state.gamma, state.wrong_sky) == ("", [])
 
 
-def test_before_a_run_is_followed_its_ledger_alone_is_known(memory, tmp_path):
-    state = watched_run(FramePublisher(memory), tmp_path)
-    state._feed.running = None
-    assert state.now().ledger is not None and state.now().alive_ns == 0
+def test_before_a_run_is_followed_its_ledger_alone_is_known(memory, parts, tmp_path):
+    parts.ledger.begin(lambda: parts.make_ledger(tmp_path / "run.mcap"))
+    state = WatchedRun(FramePublisher(memory), parts).now()
+    parts.ledger.end()
+    assert state.ledger is not None and state.alive_ns == 0
 
 
 @pytest.mark.parametrize(("mode", "is_known"), [("none", None), ("one-way", False), ("unix", True)])
-def test_a_clock_that_is_not_compared_is_none(feed, tmp_path, mode, is_known):
-    run = watched_run(feed, tmp_path)
-    feed.running.clock = lambda: ClockSummary(mode, 1.0, 2.0, 3.0)
-    clock = run.now().clock
+def test_a_clock_that_is_not_compared_is_none(feed, running, parts, mode, is_known):
+    feed.follow(replace(running, clock=lambda: ClockSummary(mode, 1.0, 2.0, 3.0)))
+    clock = WatchedRun(feed, parts).now().clock
     assert (None if clock is None else clock.synchronised) is is_known
 
 
-def test_an_answer_is_published_with_what_was_lit_and_its_stars(memory, feed):
+def test_an_answer_is_published_with_what_was_lit_and_its_stars(memory, feed, running):
     stars = tuple(ReportedStar(k + 0.126, k, 300.0) for k in range(MAX_CENTROIDS + 3))
-    lit = SimpleNamespace(q=np.array([0.5, 0.5, 0.5, -0.5]))
-    newest = SimpleNamespace(lit=lit, answer=SimpleNamespace(centroids=stars))
-    figures = TrackerFigures(right=3)
-    answers = SimpleNamespace(heard=None, newest=newest, figures=figures)
-    feed.follow(SimpleNamespace(answers=answers))
+    lit = Lit(np.array([0.5, 0.5, 0.5, -0.5]), np.zeros(3), 0, first=7, last=9)
+    answers = running.answers
+    answers.figures = figures = TrackerFigures(right=3)
+    answers.newest = Judged(Answer(0, b"", None, Q, centroids=stars), "right", 0, 0.0, lit)
     answers.heard(answers)
     answers.newest = None
     answers.heard(answers)
@@ -492,34 +488,23 @@ def test_an_answer_is_published_with_what_was_lit_and_its_stars(memory, feed):
 def test_the_settings_of_a_page_are_those_of_its_bench_and_its_listeners(tmp_path):
     changes = {"monitor": {"bits": 10, "refresh_hz": 75.0}, "attitude": {"max_rate_deg_s": 12.0}}
     file = bench_file_of(tmp_path / "my.toml", bench_text(changes))
-    page = SimpleNamespace(
-        hosts=["a"], names=["Sky.Lab"], any_address=True, port=77, token="page's"
-    )
-    scpi = SimpleNamespace(token="scpi's")
     told = RunDescription("serve", "udp", "udp://*:5560", "asked", steer_port=99)
-    setup = setup_for(Listeners(page, scpi), True, told, file, 1234)
+    anywhere = ListenAddress("0.0.0.0", 0)
+    with (
+        PageListener(anywhere, "a-token-of-the-page", ("Sky.Lab",)) as page,
+        PageListener(anywhere, "a-token-of-scpi-s-own") as scpi,
+    ):
+        setup = setup_for(Listeners(page, scpi), True, told, file, 1234)
+        alone = setup_for(Listeners(None, scpi), False, told, file, 1)
+        assert setup_for(Listeners(page, None), True, told, file, 1).scpi is None
     hello = setup.hello
-    assert (hello.command, hello.bench, hello.bits, hello.white_level) == (
-        "hilstar serve",
-        "my.toml",
-        10,
-        1023,
-    )
-    assert (hello.refresh_hz, hello.resolution_px, hello.control) == (75.0, (320, 240), True)
-    assert (setup.hosts, setup.names, setup.any_address) == (["a"], ["sky.lab"], True)
-    assert (setup.port, setup.token, setup.pace, setup.picture_bytes) == (
-        77,
-        "page's",
-        "asked",
-        1234,
-    )
+    of_bench = (hello.bench, hello.bits, hello.white_level, hello.refresh_hz, hello.resolution_px)
+    assert of_bench == ("my.toml", 10, 1023, 75.0, (320, 240))
+    assert (hello.command, hello.control) == ("hilstar serve", True)
+    assert (setup.hosts, setup.names, setup.any_address) == (page.hosts, ["sky.lab"], True)
+    assert (setup.port, setup.token) == (page.port, "a-token-of-the-page")
+    assert (setup.pace, setup.picture_bytes) == ("asked", 1234)
     assert setup.source == AttitudeSource("udp", "udp://*:5560")
-    assert setup.scpi == ScpiSetup("scpi's", "udp", 99, 12.0)
-    alone = setup_for(Listeners(None, scpi), False, told, file, 1)
-    assert (alone.port, alone.token, alone.any_address, alone.hello.control) == (
-        0,
-        "",
-        False,
-        False,
-    )
-    assert setup_for(Listeners(page, None), True, told, file, 1).scpi is None
+    assert setup.scpi == ScpiSetup("a-token-of-scpi-s-own", "udp", 99, 12.0)
+    assert (alone.port, alone.token, alone.any_address) == (0, "", False)
+    assert not alone.hello.control

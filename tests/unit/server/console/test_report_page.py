@@ -7,7 +7,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import re
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,9 +14,10 @@ import pytest
 from hilstar.basics.rotation import from_radec_roll_deg, from_rotation_vector
 from hilstar.server.console.report import (
     PAGE_DIR,
-    _answers,
+    faults_on,
     one_script,
     report_page,
+    residuals_along,
     run_data,
     verdict,
 )
@@ -167,17 +167,15 @@ def test_a_motion_in_right_ascension_is_as_wide_as_on_the_sky(dec_deg, amplitude
 
 
 def test_a_fault_that_never_ended_is_on_until_the_run_s_end():
-    faults = [SimpleNamespace(start_s=2.0, end_s=None), SimpleNamespace(start_s=1.0, end_s=5.0)]
-    summary = SimpleNamespace(answers=SimpleNamespace(faults=faults), duration_s=9.0)
-    run = SimpleNamespace(
-        first_swap_ns=10**9,
-        residuals=SimpleNamespace(rows=np.array([[3.0, 1.0, 2.0, 4.0]])),
-        answers=SimpleNamespace(wrong_ns=[4 * 10**9]),
-    )
-    told = _answers(run, summary)
-    assert (told["on_s"], told["on"]) == ([1.0, 2.0, 5.0, 9.0], [1, 2, 1, 0])
-    assert (told["t_s"], told["wrong_s"]) == ([2.0], [3.0])
-    assert told["xyz_arcsec"] == [[1.0], [2.0], [4.0]]
+    assert faults_on([(2.0, None), (1.0, 5.0)], 9.0) == ([1.0, 2.0, 5.0, 9.0], [1, 2, 1, 0])
+
+
+def test_residuals_and_wrong_answers_stand_at_their_times_in_the_run():
+    assert residuals_along(np.array([[3.0, 1.0, 2.0, 4.0]]), [4 * 10**9], 10**9) == {
+        "t_s": [2.0],
+        "xyz_arcsec": [[1.0], [2.0], [4.0]],
+        "wrong_s": [3.0],
+    }
 
 
 def test_packets_are_counted_at_their_time(reported_run):

@@ -5,13 +5,12 @@ terminal's status.
 from __future__ import annotations
 
 import time
-from types import SimpleNamespace
 
 import msgspec
 import numpy as np
 import pytest
 
-from hilstar.basics.notices import Notices
+from hilstar.attitude.receiver import PacketCounts
 from hilstar.basics.rotation import from_rotation_vector, multiply
 from hilstar.server.answers.judge import TrackerFigures
 from hilstar.server.answers.star_widths import FocusState
@@ -21,7 +20,11 @@ from hilstar.server.console.protocol import AttitudeSource, Hello
 from hilstar.server.console.run_status import RunSource, RunStatus
 from hilstar.server.console.server.app import RunCollector
 from hilstar.server.console.server.reader import RunReader
+from hilstar.server.pacer import Shown
+from hilstar.server.run_progress import Running
 from tests.support.benches import ORION_Q
+from tests.support.drawn import drawn
+from tests.support.queued_answers import unasked_answers
 
 FIGURES = TrackerFigures(
     answers=12, right=9, wrong=1, invalid=2, refused={"checksum": 3}, residual_arcsec=[1.0, -2.0, 30.0], verdict="right",
@@ -109,18 +112,14 @@ def test_the_metrics_and_the_state_have_the_trackers_figures(reader):
         assert line in text
 
 
-def test_the_terminal_has_a_line_of_the_tracker():
-    loop = SimpleNamespace(
-        tally=SimpleNamespace(frames=1, missed_frames=0, stale_frames=0), notices=Notices()
-    )
-    packets = SimpleNamespace(received=0, refused=0, refused_by={}, lost=0)
+def test_the_terminal_has_a_line_of_the_tracker(loop, small_bench):
     status = RunStatus(RunSource("zmq", "llvmpipe", 60.0))
-    status.see(SimpleNamespace(attitude=None, missing=True, swap_ns=0, stale=False))
+    status.see(Shown(0, 0, None, drawn(np.zeros((3, 4), np.uint8)), missing=True))
+    answers = unasked_answers(small_bench.config.monitor)
+    status.follow(Running(loop, PacketCounts(), answers=answers))
 
     def line(figures: TrackerFigures) -> tuple[str, bool]:
-        status.follow(
-            SimpleNamespace(loop=loop, packets=packets, answers=SimpleNamespace(figures=figures))
-        )
+        answers.figures = figures
         return next((line.text, line.well) for line in status.lines(1) if line.label == "tracker")
 
     text = (

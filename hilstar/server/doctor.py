@@ -26,7 +26,7 @@ from hilstar.basics.notices import Notices
 from hilstar.basics.resources import resource_path
 from hilstar.basics.version import __version__
 from hilstar.display.identity import TABLE, edid_identity
-from hilstar.display.render.context import create_context, described, gpus, leave_contexts
+from hilstar.display.render.context import create_context, described, gpus
 from hilstar.display.window.output_settings import findings
 from hilstar.display.window.randr import lit_outputs
 from hilstar.display.window.this_monitor import identity_here
@@ -256,7 +256,6 @@ def _catalogue() -> str:
 
 def _gpus() -> Check:
     listed = gpus()
-    leave_contexts()
     try:
         window = window_renderer()
     except MachineError:

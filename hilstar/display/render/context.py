@@ -205,11 +205,3 @@ def pinned(
     specify(EXTERNAL_VIRTUAL_MEMORY_BUFFER, size, values.ctypes.data, DYNAMIC_COPY)
     bind(EXTERNAL_VIRTUAL_MEMORY_BUFFER, 0)
     return values, buffer
-
-
-def leave_contexts() -> None:
-    """Let this thread's headless context go: it stays current after its release, and a window's
-    GLX then ends the process.
-    """
-    with contextlib.suppress(OSError, AttributeError):  # a machine without EGL has no such context
-        ctypes.CDLL(EGL_LIBRARY).eglReleaseThread()

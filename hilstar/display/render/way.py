@@ -2,6 +2,8 @@
 needs. Nothing here imports moderngl.
 """
 
+import contextlib
+import ctypes
 import os
 from typing import Literal
 
@@ -24,3 +26,11 @@ def wanted_way() -> Way | None:
         if wanted == way:
             return way
     raise InputError(f"{WAY_VARIABLE}={wanted}: no way to draw stars; write {' or '.join(WAYS)}")
+
+
+def leave_contexts() -> None:
+    """Let this thread's headless context go: it stays current after its release, and a window's
+    GLX then ends the process.
+    """
+    with contextlib.suppress(OSError, AttributeError):  # a machine without EGL has no such context
+        ctypes.CDLL(EGL_LIBRARY).eglReleaseThread()

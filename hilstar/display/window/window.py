@@ -17,6 +17,7 @@ import numpy as np
 from hilstar.basics.errors import MachineError, NoDisplayError, NotThereError, did_you_mean
 from hilstar.basics.process.closing import Closing
 from hilstar.basics.units import GL_VERSIONS, NS_PER_S
+from hilstar.display.render.way import leave_contexts
 from hilstar.display.window.awake import Awake
 from hilstar.display.window.displays import Display, display_of
 from hilstar.display.window.library import glfw
@@ -290,6 +291,7 @@ class Window(Closing):
 
     def make_current(self) -> None:
         """Take this window's GL context up again after another one was current in this thread."""
+        leave_contexts()
         glfw.make_context_current(self._window)
 
     @property
@@ -440,6 +442,7 @@ def _newest_window(width: int, height: int, monitor: Any) -> Any:
 
     A context without robustness never tells that its GPU was reset; some drivers have none with it.
     """
+    leave_contexts()
     for robustness in (glfw.LOSE_CONTEXT_ON_RESET, glfw.NO_ROBUSTNESS):
         glfw.window_hint(glfw.CONTEXT_ROBUSTNESS, robustness)
         for major, minor in GL_VERSIONS:

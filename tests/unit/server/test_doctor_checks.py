@@ -75,7 +75,6 @@ def test_a_window_s_card_is_told_where_it_is_another_than_the_first(
     monkeypatch, listed, window, is_ok, told
 ):
     monkeypatch.setattr(doctor, "gpus", lambda: [Gpu(k, name) for k, name in enumerate(listed)])
-    monkeypatch.setattr(doctor, "leave_contexts", lambda: None)
     monkeypatch.setattr(doctor, "window_renderer", lambda: window)
     check = doctor._gpus()
     assert (check.name, check.ok, check.required) == ("gpu", is_ok, False)

@@ -41,7 +41,6 @@ from hilstar.display.calibration import primary_lights
 from hilstar.display.identity import MonitorIdentity
 from hilstar.display.quantise import LitLight
 from hilstar.display.render.backend import ScreenView
-from hilstar.display.render.context import leave_contexts
 from hilstar.display.render.presenter import Presenter, level_texture, window_context
 from hilstar.display.window.this_monitor import identity_here
 from hilstar.instruments.calibrate.geometric.observed import read_image, saturated_pixels
@@ -431,7 +430,6 @@ class PatternDisplay(Closing):
 
         monitor = file.config.monitor
         screen_px = orientation_of(monitor).screen_px(monitor.resolution_px)
-        leave_contexts()  # contexts made without a window since
         if self._window is None or self._screen_px != screen_px:
             self.close()
             settings = WindowSettings(screen_px, monitor.bits, monitor.display)

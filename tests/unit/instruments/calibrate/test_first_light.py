@@ -18,7 +18,6 @@ from scipy.special import ndtr
 from hilstar.basics.errors import InputError
 from hilstar.display.geometry import monitor_camera
 from hilstar.display.window import window as windows
-from hilstar.instruments.calibrate.first_light import image_sources
 from hilstar.instruments.calibrate.first_light.context import KeyChange, StepOutcome, rewrite
 from hilstar.instruments.calibrate.first_light.focus import sharpness
 from hilstar.instruments.calibrate.first_light.geometry import (
@@ -337,8 +336,6 @@ def test_patterns_have_a_window_of_their_own_screen_s_size_and_keep_it_while_tha
     tmp_path, monkeypatch
 ):
     monkeypatch.setattr(windows, "Window", RecordedWindow)
-    # other tests of this process draw on: no window takes their context's place
-    monkeypatch.setattr(image_sources, "leave_contexts", lambda: None)
     RecordedWindow.opened = []
     screens = [
         ({}, (320, 240)),

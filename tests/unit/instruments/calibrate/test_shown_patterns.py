@@ -147,8 +147,6 @@ def panel(monkeypatch) -> Panel:
         monkeypatch.setattr(module, "Presenter", PanelPresenter)
     for module in (until_key, image_sources):
         monkeypatch.setattr(module, "time", made)
-    # other tests of this process draw on: no window takes their context's place
-    monkeypatch.setattr(image_sources, "leave_contexts", lambda: None)
     return made
 
 

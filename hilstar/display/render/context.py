@@ -15,7 +15,8 @@ from glcontext import egl
 
 from hilstar.basics.errors import InputError, MachineError, NotThereError, did_you_mean
 from hilstar.basics.units import COMPUTE_VERSION, GL_VERSIONS
-from hilstar.display.render.way import EGL_LIBRARY, wanted_way
+from hilstar.display.egl import EGL_LIBRARY
+from hilstar.display.render.way import wanted_way
 
 INSTALL_EGL = "install it: apt-get install libegl1 libgl1-mesa-dri"
 Context = moderngl.Context

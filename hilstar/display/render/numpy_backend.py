@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from hilstar.basics.arrays import Float32Array, FloatArray, IntArray
 from hilstar.basics.errors import MachineError, NotThereError
+from hilstar.display.egl import EGL_LIBRARY
 from hilstar.display.exact import ExactQuantiser
 from hilstar.display.panel import Panel
 from hilstar.display.quantise import Quantiser, UnquantisedFrame, level_dtype
@@ -26,7 +27,7 @@ from hilstar.display.render.cpu_stars import CpuImage, CpuStars
 from hilstar.display.render.light_units import LightUnits
 from hilstar.display.render.reference import extended_image
 from hilstar.display.render.target import Target
-from hilstar.display.render.way import EGL_LIBRARY, wanted_way
+from hilstar.display.render.way import wanted_way
 from hilstar.display.response import Levels
 from hilstar.optics.extended import ExtendedLight
 from hilstar.optics.sprites import FrameLight

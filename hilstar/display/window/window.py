@@ -17,7 +17,7 @@ import numpy as np
 from hilstar.basics.errors import MachineError, NoDisplayError, NotThereError, did_you_mean
 from hilstar.basics.process.closing import Closing
 from hilstar.basics.units import GL_VERSIONS, NS_PER_S
-from hilstar.display.render.way import leave_contexts
+from hilstar.display.egl import leave_contexts
 from hilstar.display.window.awake import Awake
 from hilstar.display.window.displays import Display, display_of
 from hilstar.display.window.library import glfw

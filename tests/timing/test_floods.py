@@ -24,7 +24,6 @@ from tests.support.wire.zmtp import greeted, part
 
 # bounds.MAX_GROWTH_BYTES, and what comes within the time that a loaded machine needs to see it.
 MAX_GROWTH_MB = 256 + 500
-NOT_HEARD_S = 3.0  # what is not to come is waited for so long
 
 
 @contextmanager

@@ -22,7 +22,6 @@ from tests.support.waiting import PATIENCE_S, wait_for
 
 pytestmark = pytest.mark.e2e
 JSON = {"Content-Type": "application/json"}
-TWO_HOSTS = b"GET / HTTP/1.1\r\nHost: a\r\nHost: b\r\n\r\n"
 HOSTILE = (
     b"",
     b"GET /live HTTP/1.1\r\nHost: x\r\n",

@@ -21,7 +21,6 @@ Q = "0.6987226,0.7135120,-0.0370377,0.0362700"
 OTHER = "0.5,0.5,-0.5,0.5"
 LOST = "1.0000000,0.0000000,0.0000000,0.0000000"
 HEAD = "t_s,qw,qx,qy,qz\n"
-WRITTEN_RAD = 1e-7  # seven decimals of a quaternion
 
 
 @pytest.fixture

@@ -27,7 +27,6 @@ needs_aravis = pytest.mark.skipif(
     not has_aravis(), reason="Aravis is not installed (gir1.2-aravis-0.8, python3-gi)"
 )
 AT = ("--at", "2020-01-01T00:00:00")  # of the planted stars' places
-RESULT = ("focal_length_px", "gain_e_per_dn", "distortion")
 
 
 @pytest.fixture(scope="module")

@@ -128,7 +128,6 @@ def session_of(**verdicts):
 DARK = session_of(orientation="failed")
 DARK["steps"][0]["line"] = "a black screen fills the tracker to 100% of its range"
 DONE = session_of(geometry="done", verify="done")
-CLAMPED = Comparison(0.15, 0.55, -40.0)
 GONE = result(code=3, stderr="gone")
 PASSED = {"passed": True, "reasons": []}
 

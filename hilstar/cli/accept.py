@@ -64,10 +64,10 @@ def accept(options: AcceptOptions, cases: CaseOptions, display: DisplayOptions) 
     acceptance.check()
     processes = cases.processes()
     if options.dry_run:
-        costs = [
-            (cost, [clause.capability for clause in checked.clauses_of(cost.case_set.name)])
-            for cost in acceptance.costs(processes)
-        ]
+        costs = []
+        for cost in acceptance.costs(processes):
+            clauses = checked.clauses_of(cost.case_set.name)
+            costs.append((cost, [clause.capability for clause in clauses]))
         of_time = "at most" if acceptance.on_bench else f"on {processes} cores"
         print_found(options.as_json, *costs_table(costs, of_time))
         return

@@ -191,7 +191,8 @@ class DisplayWatch:
             ramp = self._ramp()
             self.ramp_changed = is_foreign(ramp, self._first)
             # the server's events would fill its queue until somebody asks
-            _ = self.presented
+            if self._modes is not None:
+                self._modes.counts()
 
     @property
     def presented(self) -> dict[str, int]:

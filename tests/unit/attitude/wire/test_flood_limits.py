@@ -8,6 +8,7 @@ import contextlib
 import os
 import socket
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -251,6 +252,20 @@ class Look:
         return ""
 
 
+@contextlib.contextmanager
+def doorkeeper(
+    counts: LinkCounts, told: zmq_socket.ConnectionsTold, look: Look | None = None
+) -> Iterator[_Doorkeeper]:
+    """The keeper of a real socket, whose monitor is its own again at the end."""
+    with contextlib.ExitStack() as opened:
+        context = opened.enter_context(zmq.Context())
+        watched = opened.enter_context(context.socket(zmq.SUB))
+        keeper = _Doorkeeper(watched, look=look, counts=counts, told=told, notices=Notices())
+        opened.callback(keeper.close)
+        opened.callback(setattr, keeper, "monitor", keeper.monitor)
+        yield keeper
+
+
 def test_each_connection_that_we_made_ends_by_its_own_handshake_and_failure():
     """One that was greeted is lost; the next, which was not, is no partner's, and neither is one
     whose handshake failed; the last is lost again.
@@ -267,12 +282,7 @@ def test_each_connection_that_we_made_ends_by_its_own_handshake_and_failure():
     )
     counts, look, opened, lost = LinkCounts(), Look(), [], []
     told = zmq_socket.ConnectionsTold(lambda: opened.append(1), lost.append)
-    with contextlib.ExitStack() as opened_here:
-        context = opened_here.enter_context(zmq.Context())
-        watched = opened_here.enter_context(context.socket(zmq.SUB))
-        keeper = _Doorkeeper(watched, look=look, counts=counts, told=told, notices=Notices())
-        opened_here.callback(keeper.close)
-        opened_here.callback(setattr, keeper, "monitor", keeper.monitor)
+    with doorkeeper(counts, told, look) as keeper:
         for events, expected in ends:
             keeper.monitor = Monitor(*events)
             keeper.tend()
@@ -300,12 +310,7 @@ def test_a_descriptor_that_is_used_again_is_another_connection(monkeypatch):
     )
     counts = LinkCounts()
     told = zmq_socket.ConnectionsTold(lambda: None, lambda why: None)
-    with contextlib.ExitStack() as opened:
-        context = opened.enter_context(zmq.Context())
-        watched = opened.enter_context(context.socket(zmq.SUB))
-        keeper = _Doorkeeper(watched, look=None, counts=counts, told=told, notices=Notices())
-        opened.callback(keeper.close)
-        opened.callback(setattr, keeper, "monitor", keeper.monitor)
+    with doorkeeper(counts, told) as keeper:
         for events, left, expected in steps:
             keeper.monitor = Monitor(*events)
             keeper.tend()

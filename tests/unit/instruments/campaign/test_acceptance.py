@@ -232,6 +232,7 @@ FEW_CASES = SETS["lost"].replace("cases = 60", "cases = 8")  # none in 8 is fewe
     ("text", "told"),
     [
         (ONE.replace('of = "lost"', 'of = "los"'), "did you mean lost"),
+        (ONE + clause_text("availability", 0.9, "los", "minimum"), "[[clause]] number 2 (availability)"),
         (ONE.replace("minimum", "least"), "unknown key least"),
         (ONE.replace("[cases.lost]", '[cases."Lost case"]'), "small letters"),
         (ONE.replace("frames = 4", 'through = "tracker"'), "leave it out"),

@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.instruments.assess.bounded_figures import clopper_pearson
 from hilstar.instruments.campaign.acceptance import PLAN_FILE, Acceptance
 from hilstar.instruments.campaign.acceptance_plan import read_acceptance_plan
@@ -19,12 +20,14 @@ from hilstar.instruments.campaign.acceptance_verdicts import ClauseVerdict, SetR
 from hilstar.instruments.campaign.case_table import Columns
 from hilstar.instruments.campaign.requirements import MET, NOT_MET, NOT_SHOWN
 from hilstar.instruments.campaign.run import Campaign
+from hilstar.instruments.campaign.star_motion import StarMotion
 from hilstar.instruments.campaign.store import Directory
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.acceptance import write_bench
 from tests.support.planted_answers import answers
 
 CASES, SILENT = 60, 20  # of which so many have no attitude
+BIAS_ARCSEC = 3.0
 LOST = "[cases.lost]\ncases = 60\n"
 
 
@@ -81,6 +84,27 @@ def test_a_clause_that_more_cases_would_decide_is_tested_and_one_without_its_col
     assert none.verdict is None
     assert (none.word, none.unit) == ("not tested", "s")
     assert none.untested.startswith("recovery_s: the table has no such column")
+
+
+def test_a_share_of_proper_motion_that_the_tracker_lacks_is_found_by_the_fields_own_turns(
+    tmp_path: Path,
+) -> None:
+    """At dates over 40 years a tracker has followed three quarters of its stars' motion."""
+    rng = np.random.default_rng(6)
+    acceptance = acceptance_of(tmp_path, LOST + clause("proper-motion", "maximum = 0.2"))
+    cases = answers(rng)
+    jyears = 2016.0 + rng.uniform(-20.0, 20.0, cases.cases)
+    cases.numbers["vary.sky.epoch_jyear"] = jyears
+    motion = StarMotion.of(acceptance.file, None)
+    q = cases.vectors("q{}", "wxyz")
+    turns = [motion.likely_turn_rad(attitude, acceptance.scale) for attitude in q]
+    missed_arcsec = 0.25 * ARCSEC_PER_RAD * np.array(turns) * (jyears - motion.jyear)[:, None]
+    for axis, arcsec in zip("xyz", missed_arcsec.T, strict=True):
+        cases.numbers[f"error_{axis}_arcsec"] = BIAS_ARCSEC + arcsec
+    (case_set,) = acceptance.sets
+    (found,) = acceptance.verdicts([SetResult(case_set, cases)])
+    assert found.word == NOT_MET and found.verdict is not None
+    assert found.verdict.value == pytest.approx(0.25, rel=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -351,6 +351,23 @@ def test_of_more_answers_than_are_kept_those_of_the_last_ones_count(monkeypatch)
     assert figures.availability == pytest.approx(30 / 59, abs=1e-4)
 
 
+def test_no_answer_is_due_while_it_is_dark_within_the_last_minute_and_earlier_dark_is_past():
+    """Ten frames and one answer a second, of which every second one has an attitude. It is dark
+    for 8 s before the last minute, and for 6 s within it.
+    """
+    frames = LitFrames(NS_PER_S / 10)
+    judge = AnswerJudge(AnswerRules(EXPOSURE_S, clock="host"), frames)
+    for number in range(901):
+        is_dark = number in range(100, 180) or number in range(600, 660)
+        at_ns = number * NS_PER_S // 10
+        frames.add(LitFrame(number, at_ns, at_ns, None if is_dark else START))
+        if number % 10 == 5 and not is_dark:
+            valid = number % 20 == 5
+            judge.judge(Answer(at_ns, b"", at_ns - NS_PER_S // 10, START, valid=valid))
+    # the minute before 90 s has answers from 30.5 to 89.5 s but for the six of the dark
+    assert judge.figures(90 * NS_PER_S, {}).availability == pytest.approx(27 / 54, abs=1e-4)
+
+
 def test_no_answer_is_taken_to_have_come_before_its_exposure_had_ended():
     """A tracker whose answers come 20 ms after the middle of an exposure of 100 ms, by a wrong
     statement: the delay that its motion shows is not believed below 50 ms.

@@ -226,6 +226,14 @@ def test_rows_that_are_no_star_repeat_no_identifier_and_a_whole_table_says_nothi
     assert "identifier" not in caplog.text
 
 
+def test_a_hip_number_is_the_brightest_star_s_of_the_rows_that_are_stars(tmp_path):
+    """The brightest row that has the number has no colour, and is no star."""
+    text = "hip,ra_deg,dec_deg,v_mag,bv_mag\n7,1,2,3.0,\n7,3,4,5.0,0.2\n7,5,6,6.0,0.3\n"
+    (tmp_path / "t.csv").write_text(text)
+    stars = read_stars(tmp_path / "t.csv")
+    assert stars.v_mag[stars.hip == 7].tolist() == [5.0]
+
+
 def sky(count: int) -> Table:
     rng = np.random.default_rng(4)
     return Table(

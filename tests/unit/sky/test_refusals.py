@@ -116,6 +116,11 @@ ORBITS = [
             "2008-367T00:00:00",
         )
     ),
+    (ORBIT.replace(f"{EPOCH} ", "2008-09-20T13:00:00 ", 1), ":14: the epoch is not after the one"),
+    (
+        oem(segment(range(0, 600, 60)), segment(range(600, 900, 60), CENTER_NAME=None)),
+        "CENTER_NAME missing",
+    ),
     (ORBIT.replace(EPOCH, "2008-09-20T00:60:00", 1), "the epoch is"),
     (ORBIT.replace(EPOCH, "2008-09-20T00:00:60", 1), "the epoch is"),
 ]

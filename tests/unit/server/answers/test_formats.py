@@ -163,6 +163,14 @@ def test_a_field_beyond_a_frame_is_told_by_the_byte_that_lacks_counted_from_0():
         raw_number(body, 5, "u32be")
 
 
+def test_a_fraction_beside_the_seconds_of_an_epoch_keeps_its_nanoseconds():
+    """32769 / 65536 s are 500 015 258.8 ns; a float of 1.7e18 ns is known to 256."""
+    keys, framed_as = FRAMINGS["fixed"]
+    body = body_of(seconds=1_700_000_000).replace(b"\x80\x00", b"\x80\x01", 1)
+    (found,) = answers(decoder_of(**keys).feed(5, framed_as(body)))
+    assert found.t_ns == 1_700_000_000_500_015_259
+
+
 @pytest.mark.parametrize("name", FRAMINGS)
 def test_however_a_stream_is_cut_the_answers_are_the_same(name, rng):
     keys, framed_as = FRAMINGS[name]

@@ -98,6 +98,9 @@ def test_a_share_of_proper_motion_that_the_tracker_lacks_is_found_by_the_fields_
     rng = np.random.default_rng(6)
     text = f'through = "{through}"\n' + LOST + clause("proper-motion", "maximum = 0.2")
     acceptance = acceptance_of(tmp_path, text)
+    # half as wide as the field of 4.8 degrees
+    monitor = {"resolution_px": [44, 44], "pixel_pitch_um": 57.65}
+    acceptance.file = read_bench_file(write_bench(tmp_path, monitor=monitor))
     cases = answers(rng)
     jyears = 2016.0 + rng.uniform(-20.0, 20.0, cases.cases)
     cases.numbers["vary.sky.epoch_jyear"] = jyears

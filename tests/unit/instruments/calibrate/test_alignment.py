@@ -221,6 +221,14 @@ def wild_half(rng: np.random.Generator, reported: np.ndarray) -> np.ndarray:
     return np.concatenate([commanded_of(rng, 20), reported[20:]])
 
 
+def half_off(rng: np.random.Generator, reported: np.ndarray) -> np.ndarray:
+    """The first half is off by a quarter of a degree, each to a side of its own."""
+    sides = rng.normal(size=(20, 3))
+    sides *= np.radians(0.25) / np.linalg.norm(sides, axis=1, keepdims=True)
+    off = from_rotation_vectors(sides)
+    return np.concatenate([multiply(off, reported[:20]), reported[20:]])
+
+
 TOP = from_rotation_vector(np.array([0.0, np.pi / 2, 0.0]))  # a frame whose z is no boresight
 # What becomes of 40 commanded attitudes and of what a tracker reports of them.
 REFUSED = [
@@ -234,6 +242,9 @@ REFUSED = [
     (lambda c, t: (np.roll(c, -1, axis=1), t), ("commanded", "scalar last")),
     (lambda c, t: (c[[0] * 5], conjugate(t[[0] * 5])), ("inverse",)),
     (lambda c, t: (c, wild_half(np.random.default_rng(2), t)), ("half or more",)),
+    (lambda c, t: (c, half_off(np.random.default_rng(2), t)), ("half or more", "20 of 40 agree")),
+    # by the inverse one rotation would do, but for which the screen is out of view
+    (lambda c, t: (c, conjugate(multiply(TOP, c))), ("half or more",)),
     (lambda c, t: (c, multiply(TOP, c)), ("90 degrees off the boresight",)),
     (lambda c, t: (c[:2], c[:2]), ("2 pairs and 3 are needed",)),
 ]

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from hilstar.basics.rotation import from_rotation_vector
+from hilstar.basics.rotation import from_rotation_vector, normalise, to_matrix
 from hilstar.instruments.calibrate.attitude_pairs import _boresight_rad
 from hilstar.instruments.calibrate.camera_edges import check_rate
 from hilstar.instruments.calibrate.first_light.uniformity import _White, light_of_dots
@@ -17,10 +18,14 @@ from hilstar.instruments.calibrate.geometric import match
 from hilstar.instruments.calibrate.geometric.dots import DotPlan
 from hilstar.instruments.calibrate.geometric.fit import (
     HUBER,
+    POSE_STEP_RAD,
+    STEPS,
     Geometry,
     MatchedDots,
+    Model,
     Nominal,
     Problem,
+    geometry_of,
     loss_of,
     residuals_sigma,
 )
@@ -224,3 +229,26 @@ def test_a_map_that_less_than_a_third_of_many_dots_fit_is_none(rng, fitting, is_
     assert (found is not None) == is_found
     if is_found:
         np.testing.assert_allclose(found @ [0.05, -0.1, 1.0], [500, -400, 1.0], atol=3.0)
+
+
+def test_a_geometry_is_its_numbers_in_their_steps():
+    """A focal length by the power of e; a principal point about which the camera turns, so that its
+    axis stays on its pixel; and poses that turn after those that were matched.
+    """
+    monitor = Camera((1920, 1080), 6000.0, (950.0, 530.0), np.eye(3))
+    nominal = Nominal(monitor, np.array([1.0, 0.0, 0.0, 0.0]), monitor)
+    rng = np.random.default_rng(3)
+    q_poses = normalise(rng.normal(size=(2, 4)))
+    shift_px, turn_rad = np.array([3.0, -5.0]), rng.normal(size=3)
+    model = Model(("log_focal", "centre_x", "centre_y"), (), 2)
+    numbers = [0.3 / STEPS["log_focal"], *(shift_px / STEPS["centre_x"])]
+    found = geometry_of(model, nominal, q_poses, np.array([*numbers, *(turn_rad / POSE_STEP_RAD)]))
+    assert found.monitor.focal_length_px == pytest.approx(6000.0 * math.exp(0.3))
+    assert found.monitor.principal_point_px == pytest.approx((953.0, 525.0))
+    same_focal = replace(found.monitor, focal_length_px=6000.0)
+    axis_px = np.ravel(same_focal.project(same_focal.cam_to_image[:, 2][None]))
+    # to second order: 5 px of 6000, squared
+    assert axis_px == pytest.approx([950.0, 530.0], abs=0.01)
+    turned = Rotation.from_rotvec(turn_rad) * Rotation.from_quat(q_poses[1], scalar_first=True)
+    assert to_matrix(found.q_poses[1]) == pytest.approx(turned.as_matrix())
+    assert found.q_poses[0].tolist() == q_poses[0].tolist()

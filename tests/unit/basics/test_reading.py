@@ -262,6 +262,27 @@ def test_a_room_names_the_kinds_of_files_that_it_reads_once(monkeypatch):
     assert len(asked) == 3
 
 
+def test_rooms_are_asked_only_of_a_file_that_is_no_plain_text(monkeypatch, tmp_path):
+    asked = []
+
+    def kinds() -> dict[bytes, str]:
+        asked.append(1)
+        return {b"OWN\0": "a log of ours", b"DAF/CK": "a SPICE CK"}
+
+    monkeypatch.setattr(reading, "_kinds_of_rooms", [kinds])
+    path = tmp_path / "bench.toml"
+    for text in ("", "[monitor]\n", "#\tOWN\n\f\r\n~"):
+        path.write_text(text)
+        assert reading.read_text(path, "give another", 100) == path.read_bytes().decode()
+    assert not asked
+    for raw, kind in ((b"OWN\0log", "a log of ours"), (b"DAF/CK", "a SPICE CK")):
+        path.write_bytes(raw)
+        assert f"it is {kind}" in refusal(reading.read_text, path, "give another", 100)
+    path.write_text("# \N{DEGREE SIGN}\n")
+    assert reading.read_text(path, "give another", 100) == "# \N{DEGREE SIGN}\n"
+    assert len(asked) == 3
+
+
 def test_a_file_that_has_just_come_is_not_kept_whatever_age_it_states(tmp_path):
     """A copy keeps its original's time; the next one may come within the same tick."""
     path = tmp_path / "a.txt"

@@ -131,7 +131,9 @@ def test_what_is_no_orbit_is_refused(text, words):
     assert text != ORBIT
     OemOrbit(ORBIT, "a.oem", START_NS)
     line = refusal(OemOrbit, text, "a.oem", START_NS)
-    assert line.startswith("a.oem:")
+    rows = zip(ORBIT.splitlines(), text.splitlines(), strict=False)
+    changed = [number for number, (was, now) in enumerate(rows, start=1) if was != now]
+    assert line.startswith(f"a.oem:{changed[0]}: ")
     assert words in line
 
 

@@ -522,3 +522,5 @@ def test_a_dot_is_on_the_screen_to_6_px_from_the_middles_of_its_outermost_pixels
     x_px = np.array([6.0, 5.9, 633.0, 633.1, 300.0, 300.0, 300.0, 300.0])
     y_px = np.array([200.0, 200.0, 200.0, 200.0, 6.0, 5.9, 473.0, 473.1])
     assert seen.shows(x_px, y_px).tolist() == [True, False] * 4
+    lower, upper = seen.box()
+    assert (lower.tolist(), upper.tolist()) == ([EDGE_PX, EDGE_PX], [639 - EDGE_PX, 479 - EDGE_PX])

@@ -11,13 +11,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hilstar.basics.rotation import from_rotation_vector, normalise, to_matrix
+from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.instruments.calibrate.attitude_pairs import _boresight_rad
 from hilstar.instruments.calibrate.camera_edges import check_rate
 from hilstar.instruments.calibrate.first_light.uniformity import _White, light_of_dots
-from hilstar.instruments.calibrate.geometric import match
+from hilstar.instruments.calibrate.geometric import fit, match
 from hilstar.instruments.calibrate.geometric.dots import DotPlan
 from hilstar.instruments.calibrate.geometric.fit import (
+    CENTROIDS_PER_NUMBER,
     HUBER,
+    PINHOLE,
     POSE_STEP_RAD,
     STEPS,
     Geometry,
@@ -25,6 +28,7 @@ from hilstar.instruments.calibrate.geometric.fit import (
     Model,
     Nominal,
     Problem,
+    candidates,
     geometry_of,
     loss_of,
     residuals_sigma,
@@ -252,3 +256,46 @@ def test_a_geometry_is_its_numbers_in_their_steps():
     turned = Rotation.from_rotvec(turn_rad) * Rotation.from_quat(q_poses[1], scalar_first=True)
     assert to_matrix(found.q_poses[1]) == pytest.approx(turned.as_matrix())
     assert found.q_poses[0].tolist() == q_poses[0].tolist()
+
+
+def dots_seen(
+    count: int, noise_px: tuple[float, float], frames: int = 1
+) -> tuple[Problem, MatchedDots]:
+    """Dots of a monitor that is seen pixel by pixel, each in some frames, with noise along x and y."""
+    rng = np.random.default_rng(8)
+    camera = Camera((1200, 800), 9000.0, (590.0, 410.0), np.eye(3))
+    upright = np.array([1.0, 0.0, 0.0, 0.0])
+    x_px, y_px = rng.uniform(0, 1200, count), rng.uniform(0, 800, count)
+    plan = DotPlan(x_px, y_px, np.ones((count, frames), dtype=bool))
+    frame = np.repeat(np.arange(frames), count)
+    seen = [
+        np.tile(place, frames) + rng.normal(0, noise, frames * count)
+        for place, noise in zip((x_px, y_px), noise_px, strict=True)
+    ]
+    centroids = Observed(frame, np.zeros_like(frame), *seen, np.ones(len(frame)))
+    problem = Problem(plan, Nominal(camera, upright, camera), upright[None], max(noise_px))
+    return problem, MatchedDots(centroids, np.tile(np.arange(count), frames))
+
+
+def test_a_dot_s_held_out_error_is_the_mean_of_its_frames_along_each_axis():
+    """Noise of 0.02 px along x and of 0.06 along y, in four frames: half of it each."""
+    problem, data = dots_seen(400, (0.02, 0.06), frames=4)
+    found = fit.held_out(problem, "pinhole", Model(PINHOLE), 0, data)
+    assert found.dot.tolist() == list(range(400))
+    rms_px = np.sqrt((found.off_arcsec**2).mean(axis=0)) / ARCSEC_PER_RAD * 9000.0
+    # of 400 dots, each known to 1 / sqrt(800) of its sigma
+    assert rms_px == pytest.approx([0.01, 0.03], rel=5 / math.sqrt(800))
+
+
+@pytest.mark.parametrize(("name", "numbers"), [("pinhole", 4 + 2), ("pinhole + k1", 5 + 2)])
+def test_a_model_is_tried_from_so_many_centroids_and_places_a_number_on(name, numbers):
+    """A model's own numbers and a shift's two, three of a centroid's to each; and of more places than
+    numbers.
+    """
+    enough = math.ceil(CENTROIDS_PER_NUMBER * numbers / 2)
+    for count, is_tried in ((enough, True), (enough - 1, False)):
+        tried = candidates(*dots_seen(count, (0.02, 0.02)), ())
+        assert (name in [model.name for model in tried]) == is_tried
+    # as many centroids of few dots
+    few, data = dots_seen(numbers, (0.02, 0.02), frames=9)
+    assert name not in [model.name for model in candidates(few, data, ())]

@@ -192,6 +192,11 @@ def test_a_file_that_was_just_written_is_read_again(tmp_path, monkeypatch, age_s
     assert (named_bytes(path, ADVICE, 3) is named_bytes(path, ADVICE, 3)) is is_kept
     with pytest.raises(InputError, match="at most 2 bytes are read"):
         named_bytes(path, ADVICE, 2)
+    with (
+        pytest.raises(InputError, match="at most 2 bytes are read"),
+        open_lines(path, ADVICE, 2) as lines,
+    ):
+        list(lines)
 
 
 @pytest.mark.parametrize(

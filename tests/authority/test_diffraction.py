@@ -15,8 +15,6 @@ from hilstar.optics.glass.zernike import Pupil, PupilField, Term, diffracted, ps
 from hilstar.sky.spectrum import blackbody_exitance_w_m2_m
 from tests.support.claims import holds
 
-poppy = pytest.importorskip("poppy")
-
 # A pupil of 256 samples across has grey edges: measured 3e-4 of the peak against 1024 samples of
 # poppy.
 EDGE = 1e-3
@@ -64,6 +62,8 @@ def test_zernike_terms_are_those_of_poppy_s_own_optical_system():
     """poppy turns an image of its own right side up; here y is down, and with it the terms'
     sines.
     """
+    # which takes each worker that collects this file half a second
+    poppy = pytest.importorskip("poppy")
     terms = tuple(Term(kind="zernike", noll=noll, nm=nm) for noll, nm in TERMS.items())
     found = diffraction_image(terms=terms, obstruction=0.3, spiders=4, spider_width_mm=0.6)
     coefficients = np.zeros(11)

@@ -8,6 +8,7 @@ import os
 import re
 import resource
 import shutil
+import threading
 import time
 import zlib
 from pathlib import Path
@@ -422,6 +423,28 @@ def test_a_disk_that_takes_nothing_is_told_by_the_frames_and_its_return_by_the_w
             assert "ledger-stalled" in notices.active
         wait_for(lambda: "ledger-stalled" not in notices.active)
     assert told.count("ledger-stalled") == told.count("ledger-back") == 1
+
+
+@pytest.mark.parametrize(("ended_by", "waited_s"), [(None, "0.2"), ("SIGTERM", "0.1")])
+def test_the_end_of_a_run_waits_for_its_disk_and_a_stopped_one_less(
+    tmp_path, small_bench, monkeypatch, ended_by, waited_s
+):
+    monkeypatch.setattr(ledger_module, "DISK_WAITS_S", 0.2)
+    monkeypatch.setattr(ledger_module, "STOPPED_DISK_WAITS_S", 0.1)
+    monkeypatch.setattr(ledger_module, "caught", lambda: ended_by)
+    taken = threading.Event()
+    ledger = Ledger(tmp_path / "run.mcap", small_bench)
+    finish = ledger._writer.finish
+
+    def finish_later() -> None:
+        taken.wait()
+        finish()
+
+    monkeypatch.setattr(ledger._writer, "finish", finish_later)
+    ledger.close()
+    taken.set()
+    ledger._thread.join()
+    assert f"did not take its last messages within {waited_s} s" in ledger.failure
 
 
 def test_a_split_ledger_that_cannot_go_on_elsewhere_stays_and_says_so(

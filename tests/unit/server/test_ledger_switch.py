@@ -77,7 +77,11 @@ def test_a_later_ledger_has_the_scenario_and_the_faults_that_are_on():
         fault("end", "ghost", 1),
     ):
         switch.fault(record)
-    assert begun(switch).taken == [("scenario", "file"), ("start", "flash")]
+    kept = begun(switch)
+    assert kept.taken == [("scenario", "file"), ("start", "flash")]
+    # which one that goes on in another file asks for again
+    switch.fault(fault("start", "glow", 3))
+    assert [record.name for record in kept.standing()] == ["file", "flash", "glow"]
 
 
 def test_a_failure_is_told_after_its_ledger_has_ended():

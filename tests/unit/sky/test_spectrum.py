@@ -155,6 +155,11 @@ def test_a_share_of_light_is_from_nearly_0_to_1(tmp_path, value):
     assert "from 1e-06 to 1" in refusal(load_curve, value, "[tracker] transmission", tmp_path)
 
 
+@pytest.mark.parametrize("value", [1e-6, 1.0, 1])
+def test_the_smallest_and_the_largest_share_are_taken(tmp_path, value):
+    assert load_curve(value, "[tracker] transmission", tmp_path).value == pytest.approx(value)
+
+
 def test_two_constants_are_taken_over_the_range_of_silicon():
     assert Optics(30, constant_curve(0.6), constant_curve(0.9)).range_nm == (300.0, 1100.0)
 

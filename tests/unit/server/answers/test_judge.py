@@ -310,6 +310,21 @@ def test_rms_is_about_zero_and_three_sigma_about_the_mean():
     assert figures.sigma3_arcsec == pytest.approx(3 * errors.std(axis=0, ddof=1), abs=4e-3)
 
 
+def test_no_answer_is_due_while_the_sky_is_dark():
+    """Of two seconds of answers ten a second the middle one is dark: it has none."""
+    frames = LitFrames(PERIOD_NS)
+    judge = AnswerJudge(AnswerRules(EXPOSURE_S, clock="host"), frames)
+    for k in range(240):
+        dark = 60 <= k < 180
+        frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, None if dark else START))
+        if k % 6 == 0 and k >= 12 and not 60 <= k < 192:
+            judge.judge(Answer(k * PERIOD_NS, b"", (k - 6) * PERIOD_NS, START))
+    figures = judge.figures(240 * PERIOD_NS, {})
+    assert figures.right == 8 + 8
+    # the first 8 of the tenths that begin at 0.2 s, and those from 3.2 s to 4 s
+    assert figures.availability == pytest.approx(16 / 18, abs=1e-4)
+
+
 def test_a_slow_tracker_is_silent_after_five_of_its_own_cycles():
     judge = judged_at_rest(np.zeros((10, 3)), NS_PER_S)
     last_ns = 10 * NS_PER_S
@@ -349,6 +364,23 @@ def test_of_more_answers_than_are_kept_those_of_the_last_ones_count(monkeypatch)
     assert figures.rate_hz == pytest.approx(10.0)
     # the last one is due half a cycle from now
     assert figures.availability == pytest.approx(30 / 59, abs=1e-4)
+
+
+def test_no_answer_is_due_while_it_is_dark_within_the_last_minute_and_earlier_dark_is_past():
+    """Ten frames and one answer a second, of which every second one has an attitude. It is dark
+    for 8 s before the last minute, and for 6 s within it.
+    """
+    frames = LitFrames(NS_PER_S / 10)
+    judge = AnswerJudge(AnswerRules(EXPOSURE_S, clock="host"), frames)
+    for number in range(901):
+        is_dark = number in range(100, 180) or number in range(600, 660)
+        at_ns = number * NS_PER_S // 10
+        frames.add(LitFrame(number, at_ns, at_ns, None if is_dark else START))
+        if number % 10 == 5 and not is_dark:
+            valid = number % 20 == 5
+            judge.judge(Answer(at_ns, b"", at_ns - NS_PER_S // 10, START, valid=valid))
+    # the minute before 90 s has answers from 30.5 to 89.5 s but for the six of the dark
+    assert judge.figures(90 * NS_PER_S, {}).availability == pytest.approx(27 / 54, abs=1e-4)
 
 
 def test_no_answer_is_taken_to_have_come_before_its_exposure_had_ended():
@@ -503,6 +535,18 @@ def test_a_fit_that_keeps_no_answer_or_is_not_finite_is_none():
     apart[np.arange(39), np.arange(39) % 3] = 1e4
     assert fitted_delay(apart, np.zeros((39, 3)), 0.0) is None
     assert fitted_delay(error, np.full((40, 3), 1e200), 0.0) is None
+
+
+def test_a_delay_s_sigma_is_that_of_all_answers_of_a_normal_scatter():
+    """None of them is beyond eight sigmas; a MAD of 40 000 has an error of 0.6 %, of which the two
+    quiet axes share two thirds.
+    """
+    rng = np.random.default_rng(6)
+    rate = rng.normal(0, 1000.0, (40_000, 3))
+    noise_arcsec = np.array([2.0, 2.0, 9.0])
+    fit = fitted_delay(noise_arcsec * rng.standard_normal((40_000, 3)), rate, 0.0)
+    about_mean = rate - rate.mean(axis=0)
+    assert fit.sigma_s == pytest.approx(((about_mean / noise_arcsec) ** 2).sum() ** -0.5, rel=0.012)
 
 
 def test_a_delay_under_which_no_answer_is_right_is_given_up():

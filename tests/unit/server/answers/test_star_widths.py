@@ -63,7 +63,8 @@ def test_the_best_is_where_the_ring_was_sharpest(rng):
     state = widths.state
     assert (state.what, state.number, state.worse, state.still) == ("star sigma", 11, True, True)
     assert state.best_px == pytest.approx(best.figure.psf_sigma_px, abs=1e-4)
-    assert state.line.startswith("best 1.0") or state.line.startswith("best 0.9")
+    best_words = f"best {best.figure.psf_sigma_px:.3f} px"
+    assert state.line == f"{best_words} {widths.curve.readings[-1].t_s - best.t_s:.0f} s ago"
     assert widths.curve.line().startswith("  11  star sigma ")
 
 

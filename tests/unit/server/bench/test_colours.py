@@ -4,6 +4,8 @@ and what is refused.
 
 import json
 import re
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,13 +22,17 @@ from hilstar.optics.extended import LightMap, shifted
 from hilstar.optics.scan import Orientation
 from hilstar.optics.sprites import by_primary
 from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.colours import mixed_for
 from hilstar.server.console.overlay import colour_notes
+from hilstar.sky.electrons import Optics
+from hilstar.sky.spectrum import Curve, constant_curve
 from hilstar.tracker.mosaic import luminance
 from tests.support.benches import ORION_Q, TWIN, bench_text
 from tests.support.claims import holds
 from tests.support.commands import run_hilstar_here
 from tests.support.refusals import refusal
 from tests.support.spectra import NM, PANELS, bump, channel_keys, write_channels, write_panel
+from tests.support.stars import stars_at
 
 SENSOR_NM = np.arange(400.0, 721.0, 10.0)
 PASSBANDS = {
@@ -327,6 +333,36 @@ def test_nearest_mixtures_are_those_of_scipy():
     # primaries of one colour, which nothing tells apart, give the light all the same
     alike = np.ones((3, 3))
     np.testing.assert_allclose(nearest_mixtures(alike, np.full((1, 3), 2.0)).sum(), 2.0)
+
+
+EFFICIENCY = Curve(SENSOR_NM, bump(560, 170, SENSOR_NM))
+
+
+def primary_as_a_star(optics: Optics) -> Callable[..., np.ndarray]:
+    """Electrons of stars whose spectra are those of the panel's primaries, by the number that
+    stands for B-V.
+    """
+    nm = np.arange(*optics.range_nm, 0.5)
+    counted = optics.quantum_efficiency(nm) * optics.transmission(nm) * nm
+    of_primary = [np.interp(nm, NM, spectrum) @ counted for spectrum in PANELS["oled"]]
+
+    def rates(v_mag, bv_mag, vi_mag, kinds) -> np.ndarray:
+        return np.array([of_primary[int(number)] for number in bv_mag])
+
+    return rates
+
+
+def test_a_star_with_a_primary_s_spectrum_is_that_primary_alone():
+    """Where one channel counts, by the whole cumulative spectrum; knots of the curves in steps of
+    5 and 10 nm leave a thousandth.
+    """
+    optics = Optics(30.0, EFFICIENCY, constant_curve(0.9))
+    primaries = tuple(Curve(NM, spectrum) for spectrum in PANELS["oled"])
+    colours = mixed_for(primaries, {"": optics}, np.zeros((3, 2)), primary_as_a_star)
+    stars = replace(stars_at(np.eye(3), np.ones(3)), bv_mag=np.arange(3.0))
+    wanted = colours.wanted(stars)
+    assert colours.shares(wanted) == pytest.approx(np.eye(3), abs=2e-3)
+    assert wanted[:, 0] == pytest.approx(colours.mean_nm, abs=0.05)
 
 
 @pytest.mark.gpu

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
-from hilstar.display.balance import Seen
+from hilstar.display.balance import AS_USUAL, Seen
 from hilstar.display.quantise import LevelCost
 from hilstar.display.quantisers import QUANTISERS
 from hilstar.display.render.backend import level_cost
@@ -29,6 +29,7 @@ from hilstar.server.bench.build import (
     timed_frame_ms,
 )
 from hilstar.server.bench.cameras import bench_camera
+from hilstar.server.bench.code_errors import code_stars, worst_errors
 from hilstar.server.bench.config import RenderSettings
 from hilstar.server.bench.effort import (
     PATH_MS,
@@ -123,6 +124,29 @@ def test_the_cheapest_of_all_combinations_within_is_taken():
         tried += 1
         assert not other.within or one.ms >= taken.taken.ms
     assert tried > 20
+
+
+def test_codes_that_take_longer_than_exact_ones_save_nothing():
+    sky = light_range(12, 6.0)
+    for codes_ms, saves in (((2.0, 5.0), True), ((5.0, 2.0), False)):
+        asked = render_settings(quantisation="round", codes_ms=codes_ms)
+        assert part(planned(asked, sky), "codes").saved_ms == pytest.approx(3.0 if saves else 0.0)
+
+
+def test_of_stars_at_rest_and_on_paths_the_worse_errors_count():
+    """A path of 10 px has at most 1.9 / 10 of the brightest pixel of a star at rest: a star of
+    which that is one and a half times half a step is seen on it, and one of half of that is not.
+    """
+    path_px = 10.0
+    response = srgb_response(10)
+    lit_share = response.half_step * path_px / 1.9
+    for factor, seen in ((1.5, True), (0.75, False)):
+        peak = np.array([factor * lit_share])
+        stars = code_stars(GaussianPsf(SIGMA), AS_USUAL, 1, ("fit",), response, peak)
+        still = worst_errors(stars, "round")
+        both = worst_errors(replace(stars, path_px=path_px), "round")
+        assert math.isfinite(both.flux_mag) == seen
+        assert both.turns and both.place_px > still.place_px == both.still_px
 
 
 @pytest.mark.parametrize(

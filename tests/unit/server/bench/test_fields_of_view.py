@@ -86,6 +86,12 @@ def test_a_length_in_another_unit_is_named_with_what_was_meant(tmp_path, key, va
     assert f"{name} = {float(value):.6g} in {unit}, which is {meant}" in warning
 
 
+def test_an_f_number_in_place_of_an_aperture_is_named_with_the_aperture(tmp_path):
+    warning = fields(tmp_path, ("aperture_mm = 30\n", "aperture_mm = 2.8\n")).warning
+    assert warning is not None
+    assert "[tracker] aperture_mm = 2.8 the f-number, which is 25" in warning  # 70 mm over 2.8
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [

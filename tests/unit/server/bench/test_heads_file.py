@@ -35,6 +35,10 @@ def test_each_head_has_its_own_bench_and_the_common_source(tmp_path):
         ('heads = ["a.toml", "heads.toml"]', "give one of its heads' files"),
         ('heads = ["a.toml", "b.toml"]\n[attitude]\nlockstep = true', "lockstep"),
         ('heads = ["a.toml", "b.toml"]\n[attitude]\nsource = "pigeon"', "source"),
+        (
+            'heads = ["a.toml", "b.toml"]\n[attitude]\nconvention = { frame = "cam" }',
+            'several heads have one source, the attitude of the body; write frame = "body"',
+        ),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line(tmp_path, text, words):

@@ -118,6 +118,7 @@ def test_the_hash_of_a_bench_file_does_not_change_with_the_day(moon_file, monkey
 
 
 def test_a_log_in_another_scale_is_refused(moon_file):
+    assert dated(read_bench_file(moon_file), "UTC", 10**18).config.sky.epoch_utc == "unix"
     with pytest.raises(InputError, match='"unix": the times of this log are TAI; write "source"'):
         dated(read_bench_file(moon_file), "TAI", 10**18)
 

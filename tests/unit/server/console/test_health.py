@@ -91,6 +91,11 @@ def test_a_slow_display_is_not_a_loop_that_hangs():
     assert found(hz=1.0, alive_ns=NOW - 3 * S)
 
 
+def test_a_loop_hangs_by_the_run_s_own_times_not_by_when_the_page_looks():
+    """The limit is half a second; the state is 0.4 s old, and the loop lived 0.2 s before it."""
+    assert found(host_ns=NOW - 4 * S // 10, alive_ns=NOW - 6 * S // 10) == []
+
+
 def test_a_simulator_that_asks_for_nothing_is_a_reason_in_lockstep_alone():
     late = RecentFrames(NOW - 3 * S)
     assert "no frame for 3.0 s" in found(pace="asked", lately=late)[0]

@@ -211,8 +211,15 @@ def test_pacing_is_of_the_intervals_without_a_missed_frame(run):
     assert run.reader.state().pacing == wanted
     run.look(last_ms + 1001.0, count + 1, 0, 0)
     assert run.reader.state().pacing.sd_ms == round(statistics.stdev([*plain, 90.0]), 4)
-    # a minute later none of them counts
-    run.look(last_ms + HISTORY_S * 1e3 + 2000.0, count + 1, 0, 0)
+    # a minute later those of that minute count alone
+    late_ms = last_ms + HISTORY_S * 1e3
+    for k in range(len(plain)):
+        numbers = (count + 2 + k, 0, 0)
+        run.frame(late_ms + 20.0 * k, 1.0, None, numbers, missed_before=int(k == 0))
+    run.look(late_ms + 2000.0, count + 1 + len(plain), 0, 0)
+    assert run.reader.state().pacing.sd_ms == 0.0
+    # and of none there is no pacing
+    run.look(late_ms + HISTORY_S * 1e3 + 4000.0, count + 1 + len(plain), 0, 0)
     assert run.reader.state().pacing is None
 
 

@@ -156,6 +156,16 @@ def test_a_path_s_rate_is_by_the_attitudes_time_not_the_screen_s():
         assert rates == pytest.approx([np.degrees(1e-3) / (step_ns / 1e9)] * 19, abs=2e-4)
 
 
+def test_beside_a_steady_turn_a_steady_turn_is_nothing_and_a_swing_is_itself():
+    """The turn of 0.04 rad about z takes that share of the swing of 1 deg to x."""
+    swing_rad = np.radians(1.0) * np.cos(2 * np.pi * (np.arange(40) - 19.5) / 10)
+    turns = [from_rotation_vector(np.array([0.0, swing_rad[k], -1e-3 * k])) for k in range(40)]
+    _, motion = moved_run(PERIOD_NS, turns)
+    x, y, z = motion["beside_steady"]["curves"].values()
+    assert np.abs(x).max() < 0.04 and np.abs(z).max() < 1e-3
+    assert np.ptp(y) == pytest.approx(2 * np.cos(0.1 * np.pi), abs=2e-3)
+
+
 @pytest.mark.parametrize(("dec_deg", "amplitude_deg"), [(0.0, 2.0), (60.0, 1.0)])
 def test_a_motion_in_right_ascension_is_as_wide_as_on_the_sky(dec_deg, amplitude_deg):
     swing_deg = 2.0 * np.sin(2 * np.pi * np.arange(40) / 40)

@@ -19,7 +19,7 @@ from hilstar.basics.rotation import from_rotation_vector, multiply
 from hilstar.server.bench.frame import Bench
 from hilstar.server.console.report import report, run_pictures
 from hilstar.server.record.ledger import Ledger
-from hilstar.server.record.ledger_records import FrameRecord
+from hilstar.server.record.ledger_records import FaultRecord, FrameRecord
 from hilstar.server.record.run_figures import RunFigures
 from tests.support.benches import ORION_Q, SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar_here
@@ -69,6 +69,26 @@ def test_pictures_are_the_codes_of_the_run(pictures_ledger, tmp_path):
         about = shown[round(y) - 1 : round(y) + 2, round(x) - 1 : round(x) + 2]
         assert about.max() > shown.max() / 2 > 50  # the brightest star is where the overlay says
     assert data["sky"]["stars"] and data["caution"] == ""
+
+
+def test_a_frame_that_stayed_as_the_one_before_has_no_picture(bench_with, tmp_path):
+    table = {"name": "stay", "kind": "freeze", "for_s": 1.0}
+    stay = FaultRecord(
+        host_ns=1, event="start", number=4, name="stay", kind="freeze", who="", t_ns=9,
+        table=json.dumps(table),
+    )  # fmt: skip
+    path = tmp_path / "run.mcap"
+    with Ledger(path, bench_with()) as written:
+        written.fault(stay)
+        for k in range(30):
+            record = FrameRecord(
+                frame=k, t_ns=k, light_ns=k, draw_ns=k, swap_ns=k, q=attitude_of_frame(k)
+            )
+            record.faults = (4,) if 9 <= k < 30 else ()
+            written.frame(record)
+    report(path, tmp_path)
+    pictures = run_data_of((tmp_path / "report.html").read_text())["pictures"]
+    assert pictures and all(picture["frame"] < 9 for picture in pictures)
 
 
 def test_pictures_have_the_faults_that_the_run_had(tmp_path):

@@ -61,6 +61,16 @@ def words(at, *values):
     return edit
 
 
+def word_again(at):
+    """An edit that puts the double before a word there, too."""
+
+    def edit(raw):
+        where = at * WORD_BYTES
+        raw[where : where + WORD_BYTES] = raw[where - WORD_BYTES : where]
+
+    return edit
+
+
 def segment(raw):
     first, last = struct.unpack_from("<2i", raw, RECORD_BYTES + 5 * WORD_BYTES + 4 * 4)
     return range(first, last + 1)
@@ -111,6 +121,7 @@ def cut_to(count):
         (words(-2, 0.0), "SPICE refuses it (The requested segment"),
         (words(DATA_WORD + 7 * len(TIMES) + 3, 0.0), "its times do not increase"),
         (words(DATA_WORD + 7 * len(TIMES) + 3, float("inf")), "its times do not increase"),
+        (word_again(DATA_WORD + 7 * len(TIMES) + 3), "its times do not increase"),
         (
             words(DATA_WORD + 7 * len(TIMES) + len(TIMES), 5.0),
             "its directory is not that of its times",

@@ -73,6 +73,11 @@ FRAMES = [
     ),
     (UNDATED, ENU, "begin at 0 s, no date; give --epoch-utc TIME"),
     (
+        poses("map", rotations(3), start_ns=10**6 * 10**9),
+        ENU | {"epoch_utc": "2262-04-11T00:00:00"},
+        "--epoch-utc 2262-04-11T00:00:00: UTC goes from 1677-09-22 to 2262-04-11",
+    ),
+    (
         poses("map", rotations(3)),
         ENU | {"epoch_utc": "2025-11-22T08:26:35"},
         "dates already .* leave out --epoch-utc",

@@ -125,7 +125,7 @@ def test_uniformity_is_bilinear_between_the_middles_of_its_fields(write):
     assert light == pytest.approx(plane / plane.max(), rel=1e-6)
 
 
-NOISE = "[weights]\nr = 2\ng = 5\nb = 1\n[noise]\nrelative = 0.013\n"
+NOISE = "[weights]\nr = 2\ng = 5\nb = 1\n[noise]\nrelative = 0.0135724\n"
 ERRORS = """[errors]
 light = [0.5, 1.0]
 off = [0.01, -0.02]

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
 from hilstar.instruments.campaign.display_tracker import DisplayTracker
@@ -96,6 +97,20 @@ def test_a_frame_its_truth_and_a_run_s_frame_have_the_same_satellite(tle_bench):
         assert (
             bench.shown_stars.names(np.unique(sprites.star[sprites.star >= first])).count(name) == 1
         )
+
+
+def test_a_satellite_has_the_sun_s_light_whatever_else_the_sky_shows(tle_bench):
+    file = read_bench_file(tle_bench)
+    rates = []
+    for moon in (False, True):
+        bodies = structs.replace(file.config.sky.bodies, moon=moon)
+        sky = structs.replace(file.config.sky, bodies=bodies)
+        moving = bench_moving(structs.replace(file.config, sky=sky), file.folder)
+        seen = moving.passing(Cone(NORTH, np.pi, 0.0), AT_S * S_NS)
+        now = np.zeros(len(seen))
+        rates.append(seen.rates_e_per_s(np.arange(len(seen)), now, now))
+    assert np.nanmax(rates[0]) > 0
+    np.testing.assert_allclose(*rates, rtol=1e-9)
 
 
 @pytest.mark.parametrize(("share", "is_drawn"), [(0.99, True), (1.01, False)])

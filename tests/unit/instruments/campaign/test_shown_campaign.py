@@ -27,6 +27,7 @@ from hilstar.instruments.campaign.run import Campaign
 from hilstar.instruments.campaign.store import Directory
 from hilstar.server.answers import reader
 from hilstar.server.answers.answer import Answer
+from hilstar.server.answers.pairing import LitFrame, LitFrames
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.build import open_bench
 from hilstar.server.pacer import Shown
@@ -146,6 +147,14 @@ def test_a_campaign_is_shown_from_its_plan_to_its_tables(
         f'[[fault]]\nkind = "blank"\nname = "dark"\nat_s = 0.0\nfor_s = {FAULT_S}\n'
     )
     scenario = {"key": "scenario", "values": ["faults.toml", ""]}
+    numbers = []
+    add = LitFrames.add
+
+    def numbered(frames: LitFrames, frame: LitFrame) -> None:
+        numbers.append(frame.number)
+        add(frames, frame)
+
+    monkeypatch.setattr(LitFrames, "add", numbered)
     shown = shown_campaign(
         tmp_path,
         monkeypatch,
@@ -190,6 +199,8 @@ def test_a_campaign_is_shown_from_its_plan_to_its_tables(
     assert {case for case, is_faulty in frames if is_faulty} <= faulty
     assert {case for case, _ in frames} == set(range(CASES + checks))
     assert len(shown.files) == 2
+    # they go on from one renderer to the next, as an answer's exposure may
+    assert (np.diff(numbers) > 0).all()
     assert shown.counts == list(range(CASES + checks + 1))
     assert not (tmp_path / "out" / "journal").exists()
     assert not (tmp_path / "out" / "now.json").exists()

@@ -191,13 +191,12 @@ def replayed_codes(path, log, ledger=None) -> tuple[dict[int, np.ndarray], list[
     """The codes of each frame of a replay, what was told of another renderer, and who drew it."""
     codes, told = {}, []
 
-    class Told(Notices):
-        def tell(self, kind, detail, who=""):
-            told.extend([detail] * (kind == "other-renderer"))
-            super().tell(kind, detail, who)
+    def hear(notice):
+        told.extend([notice.detail] * (notice.kind == "other-renderer"))
 
     with load(path) as bench:
-        notices = Told()
+        notices = Notices()
+        notices.listen(hear)
         kept = LedgerSwitch(None if ledger is None else Ledger(ledger, bench, notices))
         play = plan_play(log, Wanted(math.inf), bench.config)
         replay(

@@ -255,6 +255,8 @@ def test_what_is_not_there_or_not_text_is_refused(tmp_path, write):
     assert "UTF-8" in refusal(tmp_path / "bytes.toml")
     path = write(HEAD + '[uniformity]\nfile = "grid.csv"\n', grid="1.0,0\n")
     assert "no light" in refusal(path)
+    path = write(HEAD + '[uniformity]\nfile = "grid.csv"\n', grid="1.0,1\n0.9,x\n")
+    assert "grid.csv:2: column 2 = 'x' is not a finite number" in refusal(path)
     assert "add [weights]" in refusal(write(), bit_stealing=True)
     assert "the monitor has 10" in refusal("lcd-example", bits=10)
 

@@ -105,6 +105,17 @@ def test_dots_are_seen_where_the_geometry_has_them_with_light_alike(reader: Imag
     assert 0 < at_y_px.min() < 30 < height - 30 < at_y_px.max() < height - 1
 
 
+def test_dots_that_the_image_s_edge_cuts_are_left_out(reader: ImageReader) -> None:
+    geometry = geometry_of(reader.file)
+    x_px, y_px = dot_places(geometry)
+    beside = geometry.to_monitor(np.full(4, 0.3), np.linspace(40.0, 160.0, 4))
+    edge_x_px, edge_y_px = (np.rint(place).astype(np.intp) for place in beside)
+    assert not np.isin(edge_x_px, x_px).any()
+    read = reader.dots(np.append(x_px, edge_x_px), np.append(y_px, edge_y_px), 1)
+    assert len(read.x_px) > 0.9 * len(x_px)
+    assert not np.isin(edge_x_px, read.x_px).any()
+
+
 def test_a_photodiode_sees_the_true_delay(reader: ImageReader) -> None:
     delays_ms = reader.delays_ms()
     assert len(delays_ms) > 20

@@ -26,6 +26,7 @@ resolution_px = [256, 200]
 quantum_efficiency = "ccd47-20"
 [tracker.detector]
 read_noise_e = 5
+gain_e_per_dn = 2.5
 [sky]
 epoch_jyear = 2026.0
 [monitor]

@@ -12,7 +12,7 @@ from tests.support.senders import free_port
 
 ANSWERS = '[answers]\nsource = "file"\npath = "line.bin"\nformat = "json"\n'
 LINES = [
-    '{"q": [1, 0, 0, 0], "t_ns": 5}',
+    '{"q": [1, 0, 0, 0], "t_ns": 1000}',
     '{"q": [1, 0, 0, 0], "t_ns": 6, "valid": false}',
     "no answer",
     '{"q": [0, 1, 0, 0], "t_ns": 7}',
@@ -60,4 +60,6 @@ def test_recorded_answers_are_counted_valid_ones_apart_and_refused_ones_by_reaso
     assert [bytes.fromhex(row["raw"]).decode() for row in rows][:2] == LINES[:2]
     spoken = run_hilstar_here(*words, cwd=tmp_path)
     assert f"3 answers, 2 valid; refused: 1 {reason}" in spoken.stderr
-    assert len(spoken.stdout.splitlines()) == 4
+    said = spoken.stdout.splitlines()
+    assert len(said) == 4
+    assert said[0].startswith("t 0.000001 s, q +1.0000000 +0.0000000 +0.0000000 +0.0000000, RA ")

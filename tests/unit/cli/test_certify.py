@@ -200,7 +200,7 @@ def test_checks_are_counted_and_each_draws_other_figures(
         assert told["in_tolerance"] is True and told["warm_up"] is None
         assert [each["quantity"] for each in told["figures"]] == ["shift", "focus"]
         counts.append(told["checks"])
-    assert counts == turns == [1, 2]  # the certificate's own are 0
+    assert counts == [1, 2] and 0 < turns[0] < turns[1]  # the certificate's own are 0
     figures[0] = figure("shift", 9.0, False)
     third = certify(folder, "--check", "--json", virtual=True)
     assert third.returncode == 1

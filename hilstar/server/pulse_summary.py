@@ -25,7 +25,7 @@ class SyncSummary(msgspec.Struct, frozen=True, kw_only=True):
         """The pulses for a person."""
         told = f"{self.pulses} over {self.port}, {self.skipped} skipped"
         if self.lost:
-            told += f", lost {self.lost} times"
+            told += f", losses of the line: {self.lost}"
         if self.delay_ms is None or self.jitter_ms is None:
             return told
         return (

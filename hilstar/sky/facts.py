@@ -152,7 +152,7 @@ def motion_at(
         jacobian[:, 2, k] = varied_pm_ra.imag / STEP
         jacobian[:, 3, k] = varied_pm_dec.imag / STEP
     return PropagatedPlaces(
-        ra_deg=np.degrees(np.arctan2(y, x)) % 360.0,
+        ra_deg=np.degrees(np.arctan2(y, x)),
         dec_deg=np.degrees(np.arctan2(z, flat)),
         pm_ra_mas_yr=pm_ra.real / RAD_PER_MAS,
         pm_dec_mas_yr=pm_dec.real / RAD_PER_MAS,

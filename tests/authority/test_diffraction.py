@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +15,6 @@ from hilstar.optics.glass.psf_file import glass_of
 from hilstar.optics.glass.zernike import Pupil, PupilField, Term, diffracted, psf_of
 from hilstar.sky.spectrum import blackbody_exitance_w_m2_m
 from tests.support.claims import holds
-
-poppy = pytest.importorskip("poppy")
 
 # A pupil of 256 samples across has grey edges: measured 3e-4 of the peak against 1024 samples of
 # poppy.
@@ -29,6 +28,12 @@ BASE = {
     "points": 1,
     "half_px": 4,
 }
+
+
+@pytest.fixture(scope="module", autouse=True)
+def poppy() -> Any:
+    """Every test here needs it; to import it takes 0.3 s, which no other test has to wait for."""
+    return pytest.importorskip("poppy")
 
 
 def diffraction_image(per_px: int = 8, **keys) -> np.ndarray:
@@ -60,10 +65,12 @@ def test_a_round_pupil_has_the_airy_pattern_and_its_share_outside_the_stamp(obst
 TERMS = {5: 60.0, 7: 80.0, 8: -50.0, 11: 40.0}
 
 
-def test_zernike_terms_are_those_of_poppy_s_own_optical_system():
+def test_zernike_terms_are_those_of_poppy_s_own_optical_system(poppy):
     """poppy turns an image of its own right side up; here y is down, and with it the terms'
     sines.
     """
+    # which takes each worker that collects this file half a second
+    poppy = pytest.importorskip("poppy")
     terms = tuple(Term(kind="zernike", noll=noll, nm=nm) for noll, nm in TERMS.items())
     found = diffraction_image(terms=terms, obstruction=0.3, spiders=4, spider_width_mm=0.6)
     coefficients = np.zeros(11)

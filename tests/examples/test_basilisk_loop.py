@@ -13,21 +13,20 @@ import pytest
 from tests.examples.support import copied
 from tests.support.waiting import PATIENCE_S
 
-# 9 s of real time: 72 arcsec with a bandwidth of 0.6 rad/s have decayed to some arcsec by the last
-# quarter; what is
-# left is the tracker's noise, 0.1 arcsec and 1.2 about the boresight, through the controller.
-# Measured 0.3 to 3.6, and 3, with half of the answers on a machine with eight times the work of its
-# cores.
-ACROSS_ARCSEC, ABOUT_ARCSEC = 10.0, 40.0
+# 6 s of real time: 25 arcsec with a bandwidth of 0.6 rad/s have decayed to 5 and then 2 arcsec in the
+# last quarter; what is added is the tracker's noise, 0.1 arcsec and 1.2 about the boresight, through
+# the controller. Measured 0.1 to 3.5, and 5, on a machine with three times the work of its cores.
+SLEW_DEG, SECONDS = 0.007, 6
+ACROSS_ARCSEC, ABOUT_ARCSEC = 10.0, 15.0
 # The loop is closed in real time: a machine that loses answers, or is late with them, flies another
 # loop, of which nothing is stated.
 # the tracker exposes ten times a second: more frames than twice that are work for nobody
 REFRESH_HZ = 20
-MIN_ANSWERS, MAX_AGE_MS = 76, 250.0
+MIN_ANSWERS, MAX_AGE_MS = 50, 250.0
 
 
 def test_a_slew_settles_by_nothing_but_the_trackers_answers(tmp_path):
-    command = [sys.executable, "basilisk_loop.py", "0.02", "9"]
+    command = [sys.executable, "basilisk_loop.py", str(SLEW_DEG), str(SECONDS)]
     folder = copied(tmp_path)
     bench = folder / "bench.toml"
     bench.write_text(
@@ -41,7 +40,7 @@ def test_a_slew_settles_by_nothing_but_the_trackers_answers(tmp_path):
     assert found["answers"] > 0
     if found["answers"] < MIN_ANSWERS or found["answer_age_ms"] > MAX_AGE_MS:
         pytest.skip(
-            f"a busy machine: {found['answers']} answers of 90, {found['answer_age_ms']:.0f} ms old"
+            f"a busy machine: {found['answers']} answers of 60, {found['answer_age_ms']:.0f} ms old"
             " in the middle"
         )
     assert found["pointing_rms_arcsec"]["x"] < ACROSS_ARCSEC

@@ -32,19 +32,11 @@ def test_the_screen_shows_the_codes_bit_for_bit(screen, screen_file):
     assert summary["stale_frames"] == 0
 
 
-@pytest.mark.parametrize(
-    ("keys", "turned"),
-    [
-        ("flip_x = true", lambda codes: codes[:, ::-1]),
-        ("flip_y = true", lambda codes: codes[::-1]),
-        ("rotate_deg = 180", lambda codes: codes[::-1, ::-1]),
-    ],
-)
-def test_optics_that_mirror_are_met_by_flips(screen, screen_file, keys, turned):
-    codes = codes_of(screen_file)
-    screen_file.write_text(SCREEN_BENCH.replace("[collimator]", f"{keys}\n[collimator]"))
+def test_optics_that_mirror_are_met_by_flips(screen, screen_file):
+    mirrored = codes_of(screen_file)[:, ::-1]
+    screen_file.write_text(SCREEN_BENCH.replace("[collimator]", "flip_x = true\n[collimator]"))
     with Shown(screen, screen_file) as shown:
-        assert (shown.wait_for(turned(codes)) == turned(codes)).all()
+        assert (shown.wait_for(mirrored) == mirrored).all()
 
 
 def test_a_portrait_bench_is_turned_onto_a_landscape_screen(screen, screen_file):
@@ -228,7 +220,6 @@ def test_the_dots_of_a_plan_come_up_turned_as_the_stars_are(screen, screen_file,
             ),
         ),
         (16, 8, ("the X screen has 5 bits per colour and the window 8, so that X converts",)),
-        (30, 8, ("the X screen has 10 bits per colour and the window 8, so that X converts",)),
         (30, 10, ("gamma ramp has 256 steps, too few for 10 bits",)),
     ],
 )

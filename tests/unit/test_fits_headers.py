@@ -315,6 +315,15 @@ def test_rows_from_the_bottom_are_turned_over():
     assert (read_fits_image(file_of(given)).pixels == given.data[::-1]).all()
 
 
+def test_of_several_images_the_first_is_taken_and_tables_are_none_of_them():
+    table = fits.BinTableHDU.from_columns([fits.Column("a", "J", array=np.arange(3))])
+    first = fits.ImageHDU(mosaic("RGGB"))
+    other = fits.ImageHDU(mosaic("RGGB") + 1)
+    found = read_fits_image(file_of(fits.PrimaryHDU(), table, first, other))
+    assert (found.pixels == first.data).all()
+    assert found.notes == ("holds 2 images, of which the first is taken",)
+
+
 KEYS = {"BAYERPAT": "RGGB", "DATE-OBS": EIGHT_PM, "EXPTIME": 10.0}
 
 

@@ -40,7 +40,7 @@ MAX_BYTES = 50_000_000
 UNIX_MJD = 40_587  # the modified Julian day of 1970-01-01
 # From Sputnik's launch (1957-10-04) to the end of 2099. A smaller number is a day from 1950, as
 # CNES's own Julian days are.
-DAYS = range(36_115, 88_070)
+DAYS = range(36_115, 88_069)
 DAY_SECONDS = 86_401  # of a day with a leap second
 FORM = "write the modified Julian day, its seconds and the quaternion, the real part first"
 UNNAMED_BODY = "UNDEFINED"  # what some writers put where the spacecraft's frame belongs

@@ -357,8 +357,8 @@ class Assessment:
             longest = int(np.argmax(hold_s))
             middle_s = self.run.commanded.held_s[longest].mean()
             share = f"{share}, up to {hold_s[longest]:.3f} s about {middle_s:.2f} s"
-        touched = f"{len(self.found.held)} answers looked while a frame was held for them"
-        return f"{missed} ({share}); {touched}, and are in no figure but the availability"
+        touched = f"answers that looked while a frame was held for them: {len(self.found.held)}"
+        return f"{missed} ({share}); {touched}, in no figure but the availability"
 
 
 class LedgerAnswers(NamedTuple):

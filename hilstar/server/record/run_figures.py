@@ -719,7 +719,7 @@ def _event_rows(report: RunReport) -> dict[str, str]:
         pulses = f"{report.pulses['sent']} at their frames, {report.pulses['skipped']} skipped"
         lost = report.pulses["lost"]
         if lost:
-            pulses += f", the line lost {lost} times"
+            pulses += f", losses of the line: {lost}"
     stars = f"at most {report.stars_drawn} drawn, {report.clipped} clipped"
     rows = {}
     rows["packets"] = f"{accepted} accepted, {refused} refused, {report.lost_packets} lost"

@@ -23,7 +23,6 @@ SEED = 48
 WHOLE_NUMBER = 17
 # What each is there for.
 NUMBERS = {
-    3: "turned by 29 degrees, mirrored, of 10 bits",
     7: "seen twice over, a PSF of 0.36 px, a black level of 8e-4, hot pixels",
     21: "a PSF of 0.37 px before a pixel of 0.31: dots lie within a tracker pixel",
     22: "an S-curve and a wide field",

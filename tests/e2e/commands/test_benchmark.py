@@ -26,7 +26,7 @@ FEWER_ROUNDS = """
 from dataclasses import replace
 from hilstar.__main__ import main
 from hilstar.instruments.study.speed import benchmark
-benchmark.QUICK = replace(benchmark.QUICK, starts=1, rounds=12, budget_s=0.7)
+benchmark.QUICK = replace(benchmark.QUICK, starts=1, rounds=8, budget_s=0.4)
 main()
 """
 GRID = ("--stars", "100,1000", "--sizes", "640x480")
@@ -159,7 +159,8 @@ def test_the_virtual_tracker_is_timed_beside_its_peers(measured):
 
 
 def test_a_bench_file_is_measured_at_its_own_size(small_bench_file, monkeypatch):
-    monkeypatch.setattr(benchmark, "QUICK", replace(benchmark.QUICK, starts=1, exposures=0))
+    fewer = replace(benchmark.QUICK, starts=1, rounds=2, budget_s=0.1, exposures=0)
+    monkeypatch.setattr(benchmark, "QUICK", fewer)
     result = run_hilstar_here("benchmark", small_bench_file, "--quick", "--stars", "50")
     assert result.returncode == 0, result.stderr
     assert "320 x 240" in result.stdout

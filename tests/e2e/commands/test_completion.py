@@ -26,19 +26,17 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-@pytest.fixture
-def env(tmp_path):
-    return {
-        "HOME": str(tmp_path),
+@pytest.fixture(scope="module")
+def env(tmp_path_factory):
+    """A user's environment, in whose home completion is installed from within a bash."""
+    home = tmp_path_factory.mktemp("home")
+    env = {
+        "HOME": str(home),
         "PATH": f"{INSTALLED.parent}:{os.environ['PATH']}",
         "SHELL": str(BASH),
         "TERM": "dumb",
         "PS1": "$ ",
     }
-
-
-def installed(env):
-    """What bash reads when it starts, once completion is installed from within a bash."""
     done = subprocess.run(
         [str(BASH), "--norc", "-c", "hilstar --install-completion; exit $?"],
         env=env,
@@ -49,7 +47,7 @@ def installed(env):
     )
     assert done.returncode == 0, done.stderr
     assert "bash completion installed" in done.stdout
-    return Path(env["HOME"]) / ".bashrc"
+    return env
 
 
 def typed(env, keys, wanted):
@@ -70,7 +68,6 @@ def typed(env, keys, wanted):
 
 
 def test_tab_in_a_real_bash_completes_an_option_and_the_line_runs(env):
-    installed(env)
     assert f"hilstar {hilstar.__version__}" in typed(
         env, "hilstar --vers\t\n", f"hilstar {hilstar.__version__}"
     )
@@ -96,14 +93,13 @@ def test_tab_in_a_real_bash_completes_an_option_and_the_line_runs(env):
     ],
 )
 def test_bash_is_given_the_word(env, line, word):
-    profile = installed(env)
     words = line.split()
     ask = (
         f"COMP_WORDS=({line}); COMP_CWORD={len(words) - 1}; _hilstar_completion hilstar; echo"
         " ${COMPREPLY[@]}"
     )
     done = subprocess.run(
-        [str(BASH), "--norc", "-c", f"source {profile}; {ask}"],
+        [str(BASH), "--norc", "-c", f"source ~/.bashrc; {ask}"],
         env=env,
         capture_output=True,
         text=True,

@@ -1,37 +1,16 @@
-"""The wheel in the newest other Python that this machine has and hilstar takes: a frame, an
-exposure, and the facade. README's first command does the same by the system's own: what a Python
-between the two took away, the newest lacks too.
+"""The Pythons that this machine has and hilstar takes, by the newest of which README's first command
+is followed (test_fresh_checkout.py).
 """
 
 from __future__ import annotations
 
-import json
 import os
 import re
-import shutil
-import subprocess
 import sys
 import tomllib
 from pathlib import Path
 
-import pytest
-
 from tests.support.benches import ROOT
-from tests.support.waiting import INSTALLED_WITHIN_S
-
-HIP_OF_VEGA = 91262
-FACADE = """
-import hilstar
-from hilstar.rotation import from_radec_roll_deg
-
-with hilstar.load("bench.toml") as bench:
-    q = from_radec_roll_deg(279.235, 38.785, 0.0)
-    frame = bench.frame(q)
-    exposure = bench.simulate(q)
-    assert frame.to_table()["hip"][0] == 91262
-    assert exposure.dn.max() > exposure.dn.min()
-    print(hilstar.__version__, dir(hilstar) == sorted([*hilstar.__all__, "__version__"]))
-"""
 
 
 def others() -> dict[str, Path]:
@@ -57,49 +36,6 @@ def others() -> dict[str, Path]:
 
 def _project():
     return tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-
-
-def done(*command, cwd: Path) -> str:
-    """What a command prints, which has to end well."""
-    apart = ("PYTHONPATH", "VIRTUAL_ENV", "PYTHONHOME")
-    environment = {key: value for key, value in os.environ.items() if key not in apart}
-    result = subprocess.run(
-        [*map(str, command)],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        timeout=INSTALLED_WITHIN_S,
-        check=False,
-        env=environment | {"PIP_NO_COMPILE": "no"},
-    )
-    assert result.returncode == 0, result.stderr
-    return result.stdout
-
-
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("wheel")
-    pip = (sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, ROOT)
-    done(*pip, cwd=folder)
-    [path] = folder.glob("hilstar-*.whl")
-    return path
-
-
-@pytest.mark.skipif(not others(), reason="this machine has no other Python that hilstar takes")
-@pytest.mark.parametrize("version", list(others())[-1:])
-def test_the_wheel_works_in_another_python(version, wheel, tmp_path):
-    done(others()[version], "-m", "venv", ".venv", cwd=tmp_path)
-    programs = tmp_path / ".venv" / "bin"
-    done(programs / "pip", "install", "-q", wheel, cwd=tmp_path)
-    shutil.copy(ROOT / "configs" / "demo.toml", tmp_path / "bench.toml")
-    words = ("bench.toml", "--star", "Vega", "-o")
-    frame = json.loads(
-        done(programs / "hilstar", "frame", *words, "f.fits", "--json", cwd=tmp_path)
-    )
-    assert HIP_OF_VEGA in frame["clipped"]
-    done(programs / "hilstar", "simulate", *words, "s.fits", cwd=tmp_path)
-    text = done(programs / "python", "-c", FACADE, cwd=tmp_path)
-    assert text == f"{done(programs / 'hilstar', '--version', cwd=tmp_path).split()[1]} True\n"
 
 
 def test_the_classifiers_name_each_python_that_is_tested():

@@ -47,10 +47,10 @@ def on_a_terminal(*words, cwd):
 
 
 def test_a_catalogue_is_computed_before_ones_eyes(tmp_path):
-    words = ("catalogue", DEMO, "--faintest", "9", "-o", "stars.csv", "--json")
+    words = ("catalogue", DEMO, "--faintest", "7", "-o", "stars.csv", "--json")
     code, out, shown = on_a_terminal(*words, cwd=tmp_path)
     assert code == 0
-    assert json.loads(out)["stars"] > 80_000
+    assert json.loads(out)["stars"] > 10_000
     assert "computing the catalogue" in shown
 
 

@@ -97,7 +97,7 @@ def test_a_port_that_is_cut_stops_no_frame(tmp_path, pulse_server):
     assert json.loads(reported.stdout)["pulses"] == counts
     told = run_hilstar_here("report", tmp_path / "run.mcap", "-o", tmp_path / "report").stdout
     assert (
-        f"{counts['sent']} at their frames, {counts['skipped']} skipped, the line lost 1 times"
+        f"{counts['sent']} at their frames, {counts['skipped']} skipped, losses of the line: 1"
         in told
     )
     assert "only_counted" not in summary["ledger"]

@@ -40,7 +40,8 @@ def test_a_place_has_its_roll_and_0_without_one():
     turned = from_radec_roll_deg(40.0, -20.0, 30.0)
     assert quaternion_of(icrs.galactic, 30.0) == pytest.approx(turned)
     assert quaternion_of(icrs, 2 * u.hourangle) == pytest.approx(turned)
-    assert "roll_deg" in refusal(quaternion_of, Q, 30.0)
+    for roll_deg in (30.0, 0.0):
+        assert "roll_deg" in refusal(quaternion_of, Q, roll_deg)
 
 
 def test_a_quantity_is_turned_into_the_unit_that_is_wanted():

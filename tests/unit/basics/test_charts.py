@@ -82,6 +82,15 @@ def test_ticks_are_round_and_names_at_the_side_keep_apart(limits, ticks):
     assert heights[-1] >= 0 and heights[0] <= 1
 
 
+def test_a_finding_is_a_title_with_its_own_signs():
+    finding = "the star is 1 +- 2 px off, and 3 +- 4 mag bright"
+    with charts.panels_of(finding) as (axes,):
+        axes.plot([0, 1], [0, 1])
+    title = axes.figure.get_suptitle().replace("\N{NO-BREAK SPACE}", " ")
+    assert title.replace("\N{PLUS-MINUS SIGN}", "+-") == finding.capitalize()
+    assert "+-" not in title
+
+
 def test_figures_of_an_axis_are_a_persons():
     assert [charts.plain(v) for v in (3000, 0.5, 0.0001, 1e-5, 3e-6, 2e6, 0)] == [
         *("3000", "0.5", "0.0001", "10⁻⁵", "3·10⁻⁶", "2·10⁶", "0")

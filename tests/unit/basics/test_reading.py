@@ -192,6 +192,11 @@ def test_a_file_that_was_just_written_is_read_again(tmp_path, monkeypatch, age_s
     assert (named_bytes(path, ADVICE, 3) is named_bytes(path, ADVICE, 3)) is is_kept
     with pytest.raises(InputError, match="at most 2 bytes are read"):
         named_bytes(path, ADVICE, 2)
+    with (
+        pytest.raises(InputError, match="at most 2 bytes are read"),
+        open_lines(path, ADVICE, 2) as lines,
+    ):
+        list(lines)
 
 
 @pytest.mark.parametrize(
@@ -254,6 +259,27 @@ def test_a_room_names_the_kinds_of_files_that_it_reads_once(monkeypatch):
     assert reading.kind_of(b"OWN log") == "a log of ours"
     assert reading.kind_of(b"\x89PNG\r\n") == "a picture of ours"
     assert reading.kind_of(b"PK\x03\x04") == "a zip archive"
+    assert len(asked) == 3
+
+
+def test_rooms_are_asked_only_of_a_file_that_is_no_plain_text(monkeypatch, tmp_path):
+    asked = []
+
+    def kinds() -> dict[bytes, str]:
+        asked.append(1)
+        return {b"OWN\0": "a log of ours", b"DAF/CK": "a SPICE CK"}
+
+    monkeypatch.setattr(reading, "_kinds_of_rooms", [kinds])
+    path = tmp_path / "bench.toml"
+    for text in ("", "[monitor]\n", "#\tOWN\n\f\r\n~"):
+        path.write_text(text)
+        assert reading.read_text(path, "give another", 100) == path.read_bytes().decode()
+    assert not asked
+    for raw, kind in ((b"OWN\0log", "a log of ours"), (b"DAF/CK", "a SPICE CK")):
+        path.write_bytes(raw)
+        assert f"it is {kind}" in refusal(reading.read_text, path, "give another", 100)
+    path.write_text("# \N{DEGREE SIGN}\n")
+    assert reading.read_text(path, "give another", 100) == "# \N{DEGREE SIGN}\n"
     assert len(asked) == 3
 
 

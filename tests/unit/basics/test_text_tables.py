@@ -183,11 +183,14 @@ def test_whole_numbers_and_sharp_ones_at_the_end_are_known_to_be_whole(table_fil
         (("1.5e-05", "1.5e-05"), "1.512345678901", False),
         (("yes", "no"), "yes", True),
         (("yes", "no"), "ye", False),
+        # the row before, of a table of more rows than are looked at first
+        (("1",) * 120 + ("100",), "10", False),
+        (("1",) * 120 + ("100",), "101", True),
     ):
         text = "".join(f"1,{other}\n" for other in others)
         assert (
             len(read_table_rows(table_file(f"t_s,x_px\n{text}2,{last}"), keep_cut=False))
-            == 2 + whole
+            == len(others) + whole
         ), last
 
 
@@ -230,6 +233,17 @@ def test_columns_know_their_names_and_units(table_file):
             ("flux", "DN"),
             ("pmRA", "mas/yr"),
         ]
+
+
+def test_a_column_without_a_unit_beside_one_with_it_is_another_quantity_where_units_are_stated(
+    table_file,
+):
+    """Where none has to be, either of them may be meant."""
+    with open_table(table_file("wavelength,wavelength_um\n1,2\n"), "", LIMIT) as opened:
+        chosen = opened.chosen("wavelength_nm")
+        assert (chosen.place, float(opened.cell(["1", "2"], chosen))) == (1, 2000.0)
+        line = refusal(opened.chosen, "wavelength_nm", must_state=False)
+        assert "wavelength_nm" in line
 
 
 @pytest.mark.parametrize(

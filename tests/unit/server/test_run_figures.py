@@ -267,7 +267,7 @@ def test_the_rows_of_a_report_say_its_figures_with_their_units():
     assert rows["not the plain sky"] == "1 by an operator's keys, 1 hidden"
     assert rows["coarser paths"] == "2 frames, because the turn was too fast"
     assert rows["packets"] == "42 accepted, 8 refused, 7 lost"
-    assert rows["pulses"] == "9 at their frames, 0 skipped, the line lost 2 times"
+    assert rows["pulses"] == "9 at their frames, 0 skipped, losses of the line: 2"
     assert rows["stars"] == "at most 50 drawn, 3 clipped, 7 too faint"
     assert rows["events"] == "stale 2, fresh 1, rates-wrong 1"
     assert rows["rates-wrong"] == "0.0 s: twice"

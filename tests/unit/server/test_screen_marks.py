@@ -168,7 +168,11 @@ def test_a_run_s_limit_is_the_smaller_of_periods_and_frames():
 @pytest.mark.parametrize(
     ("changes", "line"),
     [
-        ({}, "90 over COM3, 2 skipped, lost 1 times; 0.250 ms after their frames, jitter 0.125 ms"),
+        (
+            {},
+            "90 over COM3, 2 skipped, losses of the line: 1; 0.250 ms after their frames, jitter"
+            " 0.125 ms",
+        ),
         ({"lost": 0, "delay_ms": None}, "90 over COM3, 2 skipped"),
     ],
 )

@@ -94,6 +94,18 @@ def test_a_user_s_own_hip_main_gives_the_packaged_figures(tmp_path):
             assert getattr(own, name)[k] == getattr(packaged, name)[place]
 
 
+def test_each_figure_of_a_row_is_kept_to_its_last_digit(tmp_path):
+    """None of these is a binary fraction: 100 times 0.29 is less than 29."""
+    row = ROWS[0]
+    for column, text in ((5, "1.15"), (11, "0.57"), (12, "-0.29"), (37, "1.009"), (40, "1.13")):
+        row = with_field(row, column, text)
+    path = tmp_path / "hip_main.dat"
+    path.write_text(row + "\n")
+    one = load_catalog(path)
+    kept = one.v_mag, one.parallax_mas, one.pm_ra_cosdec_mas_yr, one.bv_mag, one.vi_mag
+    assert np.concatenate(kept) == pytest.approx([1.15, 0.57, -0.29, 1.009, 1.13], abs=1e-6)
+
+
 def test_a_row_without_colour_is_read_and_left_out(tmp_path):
     path = tmp_path / "hip_main.dat"
     path.write_text(with_field(ROWS[0], 37, "      ") + "\n" + ROWS[1] + "\n")
@@ -127,6 +139,7 @@ def test_a_missing_v_minus_i_is_nan(tmp_path):
         (with_field(ROWS[0], 1, "9" * 11) + "\n", "field 1 (hip)"),
         (with_field(ROWS[0], 1, "1" * 100_000) + "\n", "field 1 (hip) is '1111"),
         (with_field(ROWS[0], 52, "PP") + "\n", "field 52 (variable) is 'PP'"),
+        (with_field(ROWS[0], 52, "\N{GREEK CAPITAL LETTER PI}") + "\n", "field 52 (variable) is"),
         (with_field(ROWS[0], 64, "-1") + "\n", "field 64 (separation_arcsec)"),
         (with_field(ROWS[0], 12, "1e9") + "\n", "field 12 (pm_ra_cosdec_mas_yr)"),
     ],

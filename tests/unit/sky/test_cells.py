@@ -80,6 +80,16 @@ def test_stars_of_a_cell_follow_each_other_by_its_parts(vectors):
     assert np.array_equal(np.sort(grid.order), np.arange(len(vectors)))
 
 
+def test_each_star_is_within_its_cell_and_no_cell_is_wider_than_its_diagonal(vectors):
+    """Cells at right ascension 0 among them, where the arc tangent jumps."""
+    grid = cell_grid(vectors)
+    radius = np.arccos(grid.cos_radius)
+    assert radius.max() < np.radians(CELL_DEG) * np.sqrt(2)
+    cell = np.repeat(np.arange(len(grid.start)), grid.count)
+    off = np.linalg.norm(vectors[grid.order] - grid.centre[cell], axis=1)
+    assert (2 * np.arcsin(off / 2) < radius[cell]).all()
+
+
 def test_no_stars_and_one_star():
     assert len(cell_grid(np.empty((0, 3))).near(np.array([1.0, 0, 0]), 1.0)) == 0
     alone = cell_grid(np.array([[0.0, 0.0, 1.0]]))

@@ -19,7 +19,7 @@ healpix = pytest.importorskip("astropy_healpix")
 # poles of its frame, and 3.9e-3 of a map that was reduced to it. A wrong frame is off by 0.1 and more.
 SMOOTH = 6e-3
 V0_W_M2_UM = 3.631e-8  # the light of V = 0 (Bessell 1998)
-FRAMES = {"G": "galactic", "C": "icrs", "E": "barycentricmeanecliptic"}
+FRAMES = {"G": "galactic", "C": "icrs", "Q": "icrs", "E": "barycentricmeanecliptic"}
 
 
 def dipole_map(path: Path, letter: str, ordering: str, nside: int = 16) -> NDArray[np.float64]:

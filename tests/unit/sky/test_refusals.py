@@ -116,6 +116,11 @@ ORBITS = [
             "2008-367T00:00:00",
         )
     ),
+    (ORBIT.replace(f"{EPOCH} ", "2008-09-20T13:00:00 ", 1), ":14: the epoch is not after the one"),
+    (
+        oem(segment(range(0, 600, 60)), segment(range(600, 900, 60), CENTER_NAME=None)),
+        "CENTER_NAME missing",
+    ),
     (ORBIT.replace(EPOCH, "2008-09-20T00:60:00", 1), "the epoch is"),
     (ORBIT.replace(EPOCH, "2008-09-20T00:00:60", 1), "the epoch is"),
 ]
@@ -126,7 +131,9 @@ def test_what_is_no_orbit_is_refused(text, words):
     assert text != ORBIT
     OemOrbit(ORBIT, "a.oem", START_NS)
     line = refusal(OemOrbit, text, "a.oem", START_NS)
-    assert line.startswith("a.oem:")
+    rows = zip(ORBIT.splitlines(), text.splitlines(), strict=False)
+    changed = [number for number, (was, now) in enumerate(rows, start=1) if was != now]
+    assert line.startswith(f"a.oem:{changed[0]}: ")
     assert words in line
 
 

@@ -197,6 +197,17 @@ def test_a_moon_that_sets_is_seen_until_its_upper_limb_is_down(centre_deg, is_se
     assert [disc.name for disc in found] == (["Moon"] if is_seen else [])
 
 
+def test_the_sun_that_brightens_a_sky_is_that_of_the_moment(caplog):
+    """At the pole its altitude is its declination: -14.5 and -8.2 degrees by Astropy's get_sun."""
+    moving = moving_sky("2026-02-10T00:00:00Z", ())
+    moving.air = plain_air(np.array([0.0, 0.0, 1.0]), (0.2,))
+    stars = stars_at(np.array([[0.0, 0.0, 1.0]]), np.ones(1))
+    moving.seen(stars, 0)
+    assert not caplog.records
+    moving.seen(stars, 18 * 86_400 * 10**9)
+    assert "the Sun stands at -8.2 degrees" in caplog.text
+
+
 @pytest.mark.parametrize("altitude_deg", [90.0, 30.0, 0.5, -0.5, -60.0])
 def test_a_satellite_is_seen_through_the_air_and_not_through_the_ground(altitude_deg):
     """Two that are lit, of a list of 30: each at its own altitude over a horizon that is put there."""

@@ -20,7 +20,14 @@ from hilstar.sky.electrons import (
     tabulate,
     tabulate_pickles,
 )
-from hilstar.sky.spectral_types import DUST_EBV_MAG, LETTERS, bare_and_dusty, class_shares
+from hilstar.sky.spectral_types import (
+    DUST_EBV_MAG,
+    DUST_MAG,
+    DUST_PER_UM,
+    LETTERS,
+    bare_and_dusty,
+    class_shares,
+)
 from hilstar.sky.spectrum import (
     Curve,
     blackbody_exitance_w_m2_m,
@@ -153,6 +160,11 @@ def test_a_tracker_that_sees_more_than_the_library_s_spectra_have_is_refused(low
 @pytest.mark.parametrize("value", [1.5, 5e-324, 1e-200, 0.0, -1.0, float("nan"), 10**400])
 def test_a_share_of_light_is_from_nearly_0_to_1(tmp_path, value):
     assert "from 1e-06 to 1" in refusal(load_curve, value, "[tracker] transmission", tmp_path)
+
+
+@pytest.mark.parametrize("value", [1e-6, 1.0, 1])
+def test_the_smallest_and_the_largest_share_are_taken(tmp_path, value):
+    assert load_curve(value, "[tracker] transmission", tmp_path).value == pytest.approx(value)
 
 
 def test_two_constants_are_taken_over_the_range_of_silicon():
@@ -359,3 +371,14 @@ def test_a_table_s_rate_is_that_of_v_0_and_a_hundredth_of_it_five_magnitudes_on(
     temperature_k = np.array([5000.0, 10_000.0, 5000.0])
     rates = table.electrons_per_s(np.array([0.0, 5.0, -2.5]), temperature_k)
     assert rates == pytest.approx([1e6, 1e2, 1e7], rel=1e-12)
+
+
+def test_dust_is_fitzpatricks_at_his_anchors():
+    """Table 3 of Fitzpatrick 1999 (PASP 111, 63) for R = 3.1: wavelengths, Angstrom, and
+    A / E(B-V).
+    """
+    angstroms = [26_500, 12_200, 6000, 5470, 4670, 4110, 2700, 2600]
+    extinction_mag = [0.265, 0.829, 2.688, 3.055, 3.806, 4.315, 6.265, 6.591]
+    assert DUST_PER_UM[1:] == pytest.approx([1e4 / each for each in angstroms], abs=5e-4)
+    assert DUST_MAG[1:] == pytest.approx(extinction_mag)
+    assert (DUST_PER_UM[0], DUST_MAG[0]) == (0.0, 0.0)

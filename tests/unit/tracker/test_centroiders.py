@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from hilstar.tracker.centroiders import Centroider, _profile, brightest, psf_places, star_places
+from hilstar.tracker.centroiders import (
+    SETTLED_PX,
+    WIDE,
+    Centroider,
+    _profile,
+    brightest,
+    psf_places,
+    star_places,
+)
 
 SIGMA = (1.05, 0.95)
 # Of Gaussians integrated over pixels: sampling's own errors; a box of 5 x 5 cuts wings, one of 3 x
@@ -70,6 +78,34 @@ def test_a_star_that_is_off_along_one_axis_alone_is_followed_to_its_place(place_
     middle = (np.zeros(1), np.zeros(1))
     x, y = psf_places(stamp, lambda *places: gaussian_images(np.stack(places)), middle)
     assert (x[0], y[0]) == pytest.approx(place_px, abs=BIAS_PX["psf"])
+
+
+def test_a_fit_ends_at_the_star_that_it_begins_at():
+    """Of two that are as bright, three pixels up and down from the middle, and a pixel aside."""
+    two = np.array([[1.0, -1.0], [-3.0, 3.0]])
+    stamp = gaussian_images(two).sum(axis=0)[None]
+    for place_px in two.T:
+        near = np.array([place_px[0] - 0.3]), np.array([place_px[1] + 0.4])
+        x, y = psf_places(stamp, lambda *places: gaussian_images(np.stack(places)), near)
+        assert (x[0], y[0]) == pytest.approx(tuple(place_px), abs=0.05)
+
+
+@pytest.mark.parametrize(("kind", "wide"), [("window", 1.0), ("wide", WIDE)])
+def test_a_window_settles_where_the_light_under_it_is_balanced(kind, wide, rng):
+    """A star on a slope, with noise: the moments about its place under the window's own Gaussian,
+    wider along y than along x, are 0.
+    """
+    sigma_px = (1.2, 2.0)
+    at = np.arange(-10.0, 11.0)
+    slope = 0.01 + 2e-4 * (at[:, None] + 3 * at)
+    stamp = gaussian_images(np.array([[0.3], [-0.2]])) + slope + rng.normal(0, 1e-3, (21, 21))
+    x, y = star_places(stamp, kind, sigma_px)
+    away_x, away_y = at - x[0], at[:, None] - y[0]
+    window = np.exp(-0.5 * ((away_x / sigma_px[0]) ** 2 + (away_y / sigma_px[1]) ** 2) / wide**2)
+    light = (window * stamp[0]).sum()
+    off_px = [(window * stamp[0] * away).sum() / light for away in (away_x, away_y)]
+    # steps shrink at least twofold from one to the next
+    assert np.abs(off_px).max() < 2 * SETTLED_PX
 
 
 HOSTILE = {

@@ -12,6 +12,7 @@ from hilstar.tracker.centroids import (
     estimate_background,
     find_stars,
     noisiest_background,
+    squares,
     star_widths,
 )
 from tests.support.refusals import refusal
@@ -246,3 +247,16 @@ def test_settings_and_images_that_are_no_numbers_are_refused():
     assert "type bool, shape (9, 9)" in refusal(find_stars, np.zeros((9, 9), dtype=bool))
     assert "shape (9,)" in refusal(find_stars, np.zeros(9))
     assert "NaN or infinite" in refusal(find_stars, np.full((9, 9), np.inf))
+
+
+def test_a_square_is_about_the_nearest_pixel_and_dark_beyond_each_edge():
+    """Of an image whose rows are not its columns: pixel (x, y) has 10 y + x, over a level of 1."""
+    height, width = 5, 7
+    image = 10.0 * np.arange(height)[:, None] + np.arange(width)
+    x_px, y_px = np.array([2.6, 0.4, 5.7]), np.array([1.6, -0.4, 4.3])
+    values, dx_px, dy_px = squares(image, 1.0, x_px, y_px, 1)
+    assert values[0].tolist() == [[11.0, 12.0, 13.0], [21.0, 22.0, 23.0], [31.0, 32.0, 33.0]]
+    assert values[1].tolist() == [[0.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 9.0, 10.0]]
+    assert values[2].tolist() == [[34.0, 35.0, 0.0], [44.0, 45.0, 0.0], [0.0, 0.0, 0.0]]
+    assert dx_px[0, 0] == pytest.approx([-0.6, 0.4, 1.4])
+    assert dy_px[0, :, 0] == pytest.approx([-0.6, 0.4, 1.4])

@@ -147,6 +147,17 @@ def test_the_gain_map_acts_on_light_before_its_shot_noise():
     assert variance_e2 == pytest.approx(5000.0, rel=0.045)
 
 
+@pytest.mark.parametrize("version", [1, 2])
+def test_the_gain_map_acts_on_light_alone(version):
+    """Dark current of 2500 electrons scatters by its shot noise; gains of 30 % would add 750."""
+    settings = DetectorSettings(
+        gain_e_per_dn=1.0, bits=16, prnu=0.3, dark_e_per_s=2500.0, noise_version=version
+    )
+    settings = replace(settings, temperature_k=settings.dark_reference_temperature_k)
+    dark = Detector(settings, SIZE_PX).expose(flat_e(0.0), 1.0, generator())
+    assert dark.std() == pytest.approx(math.sqrt(2500 + 1 / 12), rel=SIGMA_ERROR)
+
+
 def test_the_full_well_clips_before_read_noise_and_adc():
     settings = DetectorSettings(
         gain_e_per_dn=1.0, full_well_e=3000.0, bits=16, offset_dn=100.0, read_noise_e=20.0
@@ -391,7 +402,9 @@ def test_a_law_is_fitted_to_measured_quantiles(law, of):
     [
         ("gamma", ((0.5, 3.0),), "two points or more"),
         ("gamma", ((0.2, 3.0), (0.1, 4.0)), "both columns rising"),
+        ("gamma", ((0.2, 3.0), (0.4, 3.0)), "both columns rising"),
         ("gamma", ((0.0, 1.0), (0.5, 2.0)), "between 0 and 1"),
+        ("gamma", ((0.5, 1.0), (1.0, 2.0)), "between 0 and 1"),
         ("log-normal", ((0.2, 0.0), (0.5, 2.0)), "no rate of 0"),
         ("normal", ((0.9, 1.0), (0.99, 200.0)), "mean below 0"),
     ],
@@ -452,6 +465,8 @@ def test_read_noise_follows_the_readout_frequency():
     )
     table = DetectorSettings(read_noise_table=((1e4, 2.0), (1e6, 8.0)), readout_hz=1e5)
     assert table.read_noise_now_e == pytest.approx(4.0)
+    for readout_hz, noise_e in table.read_noise_table:
+        assert replace(table, readout_hz=readout_hz).read_noise_now_e == pytest.approx(noise_e)
     image = Detector(replace(table, gain_e_per_dn=0.1, offset_dn=500.0, bits=16), SIZE_PX).expose(
         flat_e(0.0), 0.0, generator()
     )
@@ -555,6 +570,12 @@ def test_cosmic_rays_reach_the_frame_and_are_off_by_default():
     with_rays = DetectorSettings(cosmic_rays_per_cm2_s=1000.0, gain_e_per_dn=1.0, bits=16)
     assert Detector(with_rays, SIZE_PX).expose(flat_e(0.0), 1.0, generator()).max() > 1000
     assert Detector(DetectorSettings(), SIZE_PX).expose(flat_e(0.0), 1.0, generator()).max() == 0
+    # They add to light: the same seed draws them first, and shot noise is what is left.
+    lit = Detector(with_rays, SIZE_PX).expose(flat_e(4000.0), 1.0, generator())
+    rays_e = cosmic_rays_e(
+        with_rays, SHAPE, 1.0, generator(), Detector(with_rays, SIZE_PX).pixel_pitch_um
+    )
+    assert (lit - rays_e).std() == pytest.approx(math.sqrt(4000 + 1 / 12), rel=SIGMA_ERROR)
 
 
 def test_false_stars_bring_their_light_and_move_from_frame_to_frame():
@@ -669,6 +690,10 @@ def test_more_rays_than_a_frame_can_hold_are_refused():
         ({"fixed_pattern": "emccd"}, '"ccd" or "cmos"'),
         ({"dark_law": "doubling"}, '"arrhenius" or "diffusion-depletion" or "ccd47-20"'),
         ({"dark_law": "ccd47-20", "temperature_k": 320.0}, "230 to 300 K"),
+        (
+            {"dark_law": "ccd47-20", "temperature_k": 240.0, "dark_reference_temperature_k": 301.0},
+            "dark_reference_temperature_k = 301.*230 to 300 K",
+        ),
         ({"column_noise_e": 5.0}, 'fixed_pattern = "cmos"'),
         ({"column_dark_e_per_s": 5.0}, 'fixed_pattern = "cmos"'),
         ({"dark_distribution": "gamma", "dsnu_e_per_s": 5.0}, "write dark_e_per_s above 0"),
@@ -679,6 +704,10 @@ def test_more_rays_than_a_frame_can_hold_are_refused():
         ),
         (
             {"readout_hz": 2e5, "read_noise_table": ((1e6, 3.0), (1e4, 9.0))},
+            "whose frequencies rise",
+        ),
+        (
+            {"readout_hz": 2e4, "read_noise_table": ((1e4, 3.0), (1e4, 4.0), (1e6, 9.0))},
             "whose frequencies rise",
         ),
     ],

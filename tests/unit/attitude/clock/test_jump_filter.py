@@ -100,6 +100,14 @@ def test_a_message_that_was_too_early_is_refused_with_by_how_much(settled):
     assert accepted.refusal is None
 
 
+def test_a_message_that_was_late_comes_before_the_next_that_is_not(settled):
+    """It was in doubt; what is timely shows that the clock did not jump, and that it was late."""
+    late = arrival(SETTLED, 2 * NS_PER_S)
+    assert settled.take(late) == []
+    timely = arrival(SETTLED + 1)
+    assert settled.take(timely) == [late, timely]
+
+
 def test_what_a_stage_held_passes_those_that_follow_it_in_the_end(settled):
     seen, shown = [], []
 

@@ -140,8 +140,11 @@ def test_version_2_is_scalar_last_and_from_a_to_b(tmp_path, frame_a):
 
 @pytest.mark.parametrize("order", ["FIRST", "LAST"])
 @pytest.mark.parametrize("direction", ["A2B", "B2A"])
-@pytest.mark.parametrize("frame_a", ["ICRF", "SC_BODY_1"])
-def test_a_quaternions_derivative_gives_the_rate_of_the_camera(tmp_path, frame_a, direction, order):
+@pytest.mark.parametrize(("frame_a", "norm"), [("ICRF", 1.0), ("SC_BODY_1", 1.0), ("ICRF", 1.0005)])
+def test_a_quaternions_derivative_gives_the_rate_of_the_camera(
+    tmp_path, frame_a, norm, direction, order
+):
+    """Whatever the quaternion's norm, within what is taken: the derivative is of the same one."""
     before, q, after = (
         ccsds_quaternion(second_from_first(frame_a, direction, s)[0])
         for s in (-DIFFERENCE_S, 0.0, DIFFERENCE_S)
@@ -149,6 +152,7 @@ def test_a_quaternions_derivative_gives_the_rate_of_the_camera(tmp_path, frame_a
     before, after = (other * np.sign(other @ q) for other in (before, after))
     parts = [q, (after - before) / (2 * DIFFERENCE_S)]
     row = np.concatenate([np.roll(part, 1) if order == "FIRST" else part for part in parts])
+    row *= norm
     keywords = {
         "ATTITUDE_TYPE": "QUATERNION/DERIVATIVE",
         "ATTITUDE_DIR": direction,

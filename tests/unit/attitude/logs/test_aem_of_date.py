@@ -30,7 +30,13 @@ CLAIMS = {"TEME": "teme-astropy", "TOD": "tod-astropy", "ITRF": "itrf-astropy"}
 MOD_TOLERANCE_RAD = 0.00015 * ARCSEC
 RATE_TOLERANCE_RAD_S = 1e-10  # polar motion's wobble turns +z by 1e-6 of the rate
 Q_FRAME_TO_BODY = Rotation.from_quat([0.1, -0.5, 0.7, 0.3])
-DATES = ["1998-03-02T04:00:00", "2012-07-01T13:31:07.25", "2024-02-29T23:59:59.25"]
+# the third on the day before a leap second
+DATES = [
+    "1998-03-02T04:00:00",
+    "2012-07-01T13:31:07.25",
+    "2016-12-31T13:30:00",
+    "2024-02-29T23:59:59.25",
+]
 FAR_KM = 1e13  # so far that neither the observer's place nor its velocity counts
 
 

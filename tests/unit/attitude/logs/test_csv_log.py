@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hilstar.attitude.logs import telemetry as tables
 from hilstar.attitude.logs.log_file import open_log
 from hilstar.attitude.logs.telemetry import read_telemetry
 from hilstar.basics.errors import InputError
 from hilstar.basics.reading import warn_once
 from tests.support.commands import run_hilstar_here
+from tests.support.refusals import refusal
 
 Q = "0.6987226,0.7135120,-0.0370377,0.0362700"
 OTHER = "0.5,0.5,-0.5,0.5"
@@ -404,3 +406,20 @@ def test_three_columns_like_rates_of_another_program_are_named(csv_of, columns, 
     told = "\n".join(line for _, line in open_log(csv_of(text)).told)
     assert (f"columns {columns.replace(',', ', ')} are not used" in told) is is_named
     assert ("rates are named rx,ry,rz" in told) is is_named
+
+
+def test_telemetry_s_attitudes_are_unit_and_its_times_rise(csv_of):
+    """A norm within the tolerance is divided out; a row again is told, unless times may fall."""
+    text = f"{HEAD}0,0.49995,0.49995,-0.49995,0.49995\n1,{OTHER}\n"
+    path = csv_of(text)
+    assert np.abs(np.linalg.norm(read_telemetry(path).q, axis=1) - 1).max() < 1e-15
+    path = csv_of(f"{text}1,{OTHER}\n")
+    assert ":4: time does not increase (t_s = 1 after 1)" in refusal(read_telemetry, path)
+    assert read_telemetry(path, rising=False).t_ns.tolist() == [0, 10**9, 10**9]
+
+
+def test_telemetry_has_so_many_rows_at_most(csv_of, monkeypatch):
+    monkeypatch.setattr(tables, "MAX_ROWS", 2)
+    text = f"{HEAD}0,{OTHER}\n1,{OTHER}\n"
+    assert len(read_telemetry(csv_of(text)).t_ns) == 2
+    assert "more than 2 rows" in refusal(read_telemetry, csv_of(f"{text}2,{OTHER}\n"))

@@ -7,6 +7,7 @@ from __future__ import annotations
 import errno
 import os
 import struct
+import zlib
 
 import pytest
 from mcap.reader import make_reader
@@ -64,6 +65,20 @@ def test_what_is_written_is_what_the_library_reads(tmp_path, writer_of):
     assert (totals.message_start_time, totals.message_end_time, totals.message_count) == (1, 9, 4)
     assert (totals.chunk_count, totals.channel_message_counts) == (2, {1: 2, 2: 2})
     assert (tmp_path / "a.mcap").stat().st_size == writer.size_bytes
+
+
+def test_the_footer_says_where_the_summary_begins_and_its_checksum(tmp_path, writer_of):
+    """MCAP's specification: the CRC-32 from the summary's first byte to the footer's field before
+    it; the first record of ours is a schema, opcode 3, and of its offsets opcode 14.
+    """
+    writer = writer_of()
+    writer.add("one", 5, b"5", 1)
+    writer.finish()
+    whole = (tmp_path / "a.mcap").read_bytes()
+    opcode, length, start, offsets, crc = struct.unpack("<BQQQI", whole[-37:-8])
+    assert (opcode, length) == (2, 20)
+    assert (whole[start], whole[offsets]) == (3, 14)
+    assert crc == zlib.crc32(whole[start:-12])
 
 
 def test_each_message_lies_where_its_chunk_s_index_has_it(tmp_path, writer_of):

@@ -189,6 +189,8 @@ CIC = [
     ),
     (cic("CIC_AEM_VERS = 1.0", "CIC_AEM_VERS = 3.0"), "CIC_AEM_VERS is 3.0; write 1.0 or 2.0"),
     (cic_time("27028 0.0"), ":17: the day 27028 is no modified Julian day from 36115 (1957)"),
+    # 2100-01-01 is 88069: 36525 days after 2000-01-01, which is 51544
+    (cic_time("88069 0.0"), ":17: the day 88069 is no modified...(1957) to 88068 (2099); days"),
     (cic_time("60310.5 0.0"), ":17: the day 60310.5 is no whole number"),
     (cic_time("60310 86401"), ":17: 86401 are no seconds of a day"),
     (cic_time("60310 -1"), ":17: -1 are no seconds of a day"),

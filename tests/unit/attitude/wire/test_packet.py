@@ -198,8 +198,8 @@ def test_every_other_kind_comes_back_as_it_was():
 
 
 def test_a_status_of_a_clock_at_the_end_of_its_range_is_sent_all_the_same():
-    sent = decode(encode(Status(0, -1, 2**63 + 5, -(2**64), 2**32 + 1, 0, 0)))
-    assert sent == Status(0, 2**32 - 1, 2**63 - 1, -(2**63), 1, 0, 0)
+    beyond = Status(0, -1, 2**63 + 5, -(2**64), 2**32 + 1, 2**32 + 2, 2**32 + 3)
+    assert decode(encode(beyond)) == Status(0, 2**32 - 1, 2**63 - 1, -(2**63), 1, 2, 3)
 
 
 def test_another_kind_is_refused_for_its_crc_and_its_length():

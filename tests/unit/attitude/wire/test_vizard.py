@@ -423,6 +423,7 @@ def test_a_velocity_goes_with_the_attitude_in_km_s_where_it_is_wanted() -> None:
         ([], "is nothing"),
         ([1.0, 2.0], "is 2.24 m/s"),
         ([3e8, 0, 0], "is 3e+08 m/s"),
+        ([0, 0, 1.01e7], "is 1.01e+07 m/s"),
         ([float("nan"), 0, 0], "is nan m/s"),
     ],
 )

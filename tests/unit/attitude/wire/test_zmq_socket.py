@@ -107,6 +107,11 @@ def test_a_place_that_cannot_be_bound_is_refused_with_what_to_do(tmp_path):
         f"{elsewhere}: not an address of this machine, so it cannot be bound; connect (--connect,"
         " bind = false) instead"
     )
+    without_files = "ipc:///proc/attitude"  # nothing can be made there, whoever asks
+    assert re.fullmatch(
+        without_files + r": cannot bind \(.+\); write the absolute path of a socket, .+",
+        refusal(ZmqRoad, without_files, bind=True),
+    )
     with ZmqRoad("tcp://127.0.0.1:*", bind=True) as road:
         # a road that binds lets go until its first read
         road.taken(0)

@@ -475,8 +475,8 @@ def test_missed_frames_are_named_on_the_terminal_and_on_the_page(tmp_path: Path)
     )
     (line,) = [line for line in run.stdout.splitlines() if line.startswith("missed frames")]
     said = re.search(
-        r"(\d+) \(.*% of refresh periods, up to .* s\); (\d+) answers looked while a frame was"
-        r" held",
+        r"(\d+) \(.*% of refresh periods, up to .* s\); answers that looked while a frame was held"
+        r" for them: (\d+)",
         line,
     )
     assert said is not None and 30 <= int(said[1]) <= 37 and int(said[2]) > 0

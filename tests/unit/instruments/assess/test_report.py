@@ -34,8 +34,8 @@ OFF_BY = (
     " the bias across and 91 % of that about"
 )
 MISSED = (
-    "6 (5.7 % of refresh periods, up to 0.188 s about 12.12 s); 1 answers looked while a frame was"
-    " held for them, and are in no figure but the availability"
+    "6 (5.7 % of refresh periods, up to 0.188 s about 12.12 s); answers that looked while a frame"
+    " was held for them: 1, in no figure but the availability"
 )
 DISPLAY = (
     "0.38 arcsec across, 1.1 arcsec about the boresight, at 7 attitudes; 81 {}"

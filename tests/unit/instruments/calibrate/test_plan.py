@@ -37,6 +37,7 @@ def test_a_plan_is_random_reproducible_and_can_be_filled_in(tmp_path):
     rows = list(csv.DictReader(texts[0].splitlines()))
     assert len(rows) == len(plans[0])
     codes = [int(row["code"]) for row in rows]
+    assert [int(row["order"]) for row in rows] == [*range(1, len(rows) + 1)]
     assert [row["value"] for row in rows] == [""] * len(rows)
     assert codes.count(0) >= 20
     # black comes back within every eight patches and three

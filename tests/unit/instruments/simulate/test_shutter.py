@@ -11,6 +11,7 @@ import pytest
 from scipy.special import ndtr
 
 from hilstar.basics.rotation import from_radec_roll_deg, propagate, to_matrix
+from hilstar.basics.units import NS_PER_S
 from hilstar.display.geometry import monitor_camera
 from hilstar.display.render.reference import linear_image
 from hilstar.instruments.campaign.display_tracker import DisplayTracker
@@ -24,6 +25,7 @@ from hilstar.optics.layers.view import Canvas, View
 from hilstar.optics.psf import MAX_CUT, GaussianPsf
 from hilstar.optics.scan import Scan
 from hilstar.server.bench.bench_file import bench_file_of, read_bench_file
+from hilstar.server.bench.frame import Bench
 from hilstar.server.sync import Exposures, seen_at
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import DetectorSettings
@@ -237,6 +239,39 @@ def test_a_still_picture_is_late_by_the_scan_out_which_drawing_along_the_path_ta
     seconds = tracker_late_s if motion == "on" else tracker_late_s - screen_late_s
     moved_px = -25 / 0.013 * np.tan(np.radians(2.0) * seconds)
     assert centres[1] - centres[0] == pytest.approx(moved_px, abs=SCAN_OUT_TOLERANCE_PX)
+
+
+@pytest.mark.parametrize(("motion", "later_s"), [("on", 0.0), ("off", 0.5 / 60)])
+def test_each_frame_before_a_rolling_shutter_has_the_sky_of_its_own_time(
+    tmp_path, monkeypatch, motion, later_s
+):
+    """The first of them begins with the exposure of the middle row; one that stands still shows
+    the sky of the middle of its refresh.
+    """
+    drawn = []
+    draw = Bench.draw
+
+    def seen(bench, q, frame, rate_rad_s, t_ns):
+        drawn.append((t_ns, q))
+        return draw(bench, q, frame, rate_rad_s, t_ns=t_ns)
+
+    monkeypatch.setattr(Bench, "draw", seen)
+    tables = {
+        "tracker": {"resolution_px": [64, 400]},
+        "sky": {"faintest_v_mag": 0.2},
+        "render": {"motion": motion, "quantisation": "round"},
+    }
+    display = DisplayTracker(filed_bench(tmp_path, tables, ROLLING))
+    q, rate_rad_s, at_ns = np.array(ORION_Q), np.radians([0.3, 1.0, -0.5]), 7 * NS_PER_S
+    display.expose(View.exposure(q, rate_rad_s, 3 / 60, at_ns), None)
+    display.close()
+    since_s = np.array([t_ns - at_ns for t_ns, _ in drawn]) / NS_PER_S
+    frames = (since_s - later_s + 1.5 / 60) * 60
+    assert frames == pytest.approx(np.arange(len(frames)) + round(frames[0]), abs=1e-6)
+    # rows lie 8 ms before and after the middle one: some see the frame before, some that after
+    assert round(frames[0]) <= -1 and round(frames[-1]) >= 3
+    for t_s, (_, shown_q) in zip(since_s, drawn, strict=True):
+        assert shown_q == pytest.approx(propagate(q, rate_rad_s, t_s), abs=1e-9)
 
 
 def test_frame_transfer_smears_each_column_by_its_light(tmp_path):

@@ -32,6 +32,7 @@ from hilstar.server.answers.formats import (
     AnswerDecoder,
     FrameDecoder,
     RefusedAnswer,
+    raw_number,
     reported_stars,
 )
 from hilstar.server.bench.config.answers import AnswersSettings, FrameField, check_answers
@@ -153,6 +154,13 @@ def test_a_declared_frame_gives_every_field(name):
         "2",
         12,
     )
+
+
+def test_a_field_beyond_a_frame_is_told_by_the_byte_that_lacks_counted_from_0():
+    body = bytes(range(8))
+    assert raw_number(body, 4, "u32be") == 0x04050607
+    with pytest.raises(IndexError, match=r"^byte 8 of 8$"):
+        raw_number(body, 5, "u32be")
 
 
 def test_a_fraction_beside_the_seconds_of_an_epoch_keeps_its_nanoseconds():

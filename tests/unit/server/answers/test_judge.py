@@ -215,6 +215,27 @@ def test_a_delay_that_no_motion_shows_goes_back_to_the_one_that_is_assumed():
     assert judge.times.sigma_s == pytest.approx(0.1)
 
 
+def test_errors_that_were_kept_go_back_with_the_delay_to_the_one_that_is_assumed():
+    """Five answers fit a delay of 0.3 s; then come thirteen that are 2 degrees off."""
+    rules = AnswerRules(EXPOSURE_S, stamp="arrival")
+    judge = AnswerJudge(rules, lit_in_turn(LitFrames(PERIOD_NS), STEADY_RAD_S))
+    judge.times.shift(DelayFit(0.3 - judge.times.guess_s, 0.01))
+    off = from_rotation_vector(np.radians([2.0, 0.0, 0.0]))
+    verdicts, assumed = [], []
+    for k in range(18):
+        host_s = 1.05 + k / 16
+        q = propagate(START, STEADY_RAD_S, host_s - 0.3)
+        host_ns = round(host_s * NS_PER_S)
+        answer = Answer(host_ns, b"", None, q if k < 5 else multiply(off, q))
+        verdicts.append(judge.judge(answer).verdict)
+        shown = propagate(START, STEADY_RAD_S, host_s - judge.times.guess_s)
+        assumed.append(residual_arcsec(q, shown))
+    assert verdicts == ["right"] * 5 + ["wrong"] * 13
+    assert judge.times.delay_s == judge.times.guess_s
+    mean = judge.figures(host_ns, {}).mean_arcsec
+    assert mean == pytest.approx(np.mean(assumed[:5], axis=0), abs=TURN_ARCSEC)
+
+
 BIAS_ARCSEC, NOISE_ARCSEC = np.array([12.0, -7.0, 30.0]), np.array([3.0, 3.0, 20.0])
 LATENCY_S, JITTER_S, DRIFT, EPOCH_NS = 0.18, 0.004, 40e-6, 123 * NS_PER_S
 
@@ -364,6 +385,23 @@ def test_of_more_answers_than_are_kept_those_of_the_last_ones_count(monkeypatch)
     assert figures.rate_hz == pytest.approx(10.0)
     # the last one is due half a cycle from now
     assert figures.availability == pytest.approx(30 / 59, abs=1e-4)
+
+
+def test_no_answer_is_due_while_it_is_dark_within_the_last_minute_and_earlier_dark_is_past():
+    """Ten frames and one answer a second, of which every second one has an attitude. It is dark
+    for 8 s before the last minute, and for 6 s within it.
+    """
+    frames = LitFrames(NS_PER_S / 10)
+    judge = AnswerJudge(AnswerRules(EXPOSURE_S, clock="host"), frames)
+    for number in range(901):
+        is_dark = number in range(100, 180) or number in range(600, 660)
+        at_ns = number * NS_PER_S // 10
+        frames.add(LitFrame(number, at_ns, at_ns, None if is_dark else START))
+        if number % 10 == 5 and not is_dark:
+            valid = number % 20 == 5
+            judge.judge(Answer(at_ns, b"", at_ns - NS_PER_S // 10, START, valid=valid))
+    # the minute before 90 s has answers from 30.5 to 89.5 s but for the six of the dark
+    assert judge.figures(90 * NS_PER_S, {}).availability == pytest.approx(27 / 54, abs=1e-4)
 
 
 def test_no_answer_is_taken_to_have_come_before_its_exposure_had_ended():

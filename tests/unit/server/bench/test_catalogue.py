@@ -4,6 +4,8 @@ others read them.
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pyarrow.parquet
 import pytest
@@ -245,6 +247,29 @@ def test_instrument_magnitudes_are_those_of_own_quadrature(tmp_path, tracker):
     assert made.columns["instrument_mag_vega"].values == pytest.approx(
         0.03 - 2.5 * np.log10(rate / vega_e), abs=1e-4
     )
+
+
+def test_a_neighbour_is_as_much_fainter_at_most_as_its_description_says(bright):
+    said = re.search(r"less than ([\d.]+) mag fainter", bright.columns["neighbour"].description)
+    neighbour_mag = bright.columns["neighbour_v_mag"].values
+    fainter_mag = neighbour_mag - bright.columns["v_mag"].values
+    # of 177 stars some have one near the limit
+    assert float(said[1]) - 0.1 < fainter_mag.max() < float(said[1])
+
+
+@pytest.mark.parametrize("system", ["vega", "ab"])
+def test_a_magnitude_s_zero_point_is_the_one_that_its_description_and_the_file_state(
+    bright, tmp_path, system
+):
+    """The magnitude of one electron per second, to the digits that are written."""
+    name = f"instrument_mag_{system}"
+    rate = bright.columns["electrons_per_s"].values
+    zero_mag = bright.columns[name].values + 2.5 * np.log10(rate)
+    stated = re.search(r"(\d+\.\d{4}) - 2\.5 log10", bright.columns[name].description)
+    assert zero_mag == pytest.approx(float(stated[1]), abs=0.6e-4)
+    write_catalogue(tmp_path / "stars.fits", bright)
+    header = fits.getheader(tmp_path / "stars.fits", 1)
+    assert zero_mag == pytest.approx(header[f"ZP{system.upper()}"], abs=0.6e-4)
 
 
 def _data(name):

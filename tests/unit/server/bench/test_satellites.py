@@ -15,6 +15,7 @@ from msgspec import structs
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
 from hilstar.instruments.campaign.display_tracker import DisplayTracker
 from hilstar.instruments.simulate.simulator import Simulator
+from hilstar.optics.layers.view import View
 from hilstar.optics.trails import DiscTrail, hidden
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.build import load
@@ -119,6 +120,25 @@ def test_a_run_s_frame_has_no_satellite_fainter_than_the_monitor_shows(tle_bench
         of_monitor = replace(bench, faintest_shown_e_per_s=share * rate)
         drawn = np.unique(of_monitor.light(view).star)
         assert (name in bench.shown_stars.names(drawn)) is is_drawn
+
+
+def test_each_frame_of_an_exposure_has_the_satellites_of_its_own_time(tle_bench, monkeypatch):
+    """Six frames of 60 Hz in a tenth of a second, about its middle."""
+    drawn = []
+    draw = Bench.draw
+
+    def seen(bench, q, frame, t_ns):
+        drawn.append(t_ns - AT_S * S_NS)
+        return draw(bench, q, frame, t_ns=t_ns)
+
+    monkeypatch.setattr(Bench, "draw", seen)
+    text = tle_bench.read_text().replace("[1024, 1024]", "[64, 64]")
+    tle_bench.write_text(text.replace("[sky]", "[sky]\nfaintest_v_mag = 3.0"))
+    display = DisplayTracker(read_bench_file(tle_bench))
+    q = from_radec_roll_deg(84.0, 0.0, 0.0)
+    display.expose(View.exposure(q, np.zeros(3), 0.1, AT_S * S_NS), None)
+    display.close()
+    assert np.array(drawn) / S_NS * 120 == pytest.approx([-5, -3, -1, 1, 3, 5], abs=1e-6)
 
 
 def fast_moment(bench: Bench) -> int:

@@ -179,6 +179,13 @@ def test_a_sky_s_discs_are_those_in_reach_nearest_first_with_their_rate():
     # 1942 arcsec at 0.988 au
     assert 2 * np.degrees(sun.radius_rad) == pytest.approx(0.5394, abs=1e-3)
     assert not moving.discs(-moon.direction, 0.1, 0.1)
+    # 1.5 radii off its middle: it is there in a cone of 0.6 radii, and not of 0.4
+    side = np.cross(moon.direction, sun.direction)
+    beside = moon.direction + 1.5 * moon.radius_rad * side / np.linalg.norm(side)
+    beside /= np.linalg.norm(beside)
+    for reach, names in ((0.6, ["Moon"]), (0.4, [])):
+        in_reach = moving.discs(beside, reach * moon.radius_rad, np.radians(0.1))
+        assert [one.name for one in in_reach] == names
     assert [one.name for one in moving.discs(moon.direction, 1e-3, np.radians(0.1))] == ["Moon"]
     # Ten days before full: what is lit is the Sun's side.
     assert moon.radiance((moon.direction + 0.003 * (sun.direction - moon.direction))[None])[0] > 0

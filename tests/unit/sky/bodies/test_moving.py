@@ -165,6 +165,7 @@ LINES = STATION_TLE.splitlines()
         ("", "not one set of two lines"),
         (LINES[1], "not one set of two lines"),
         ("\n".join(LINES[1:] * 2), "not one set of two lines"),
+        ("\n".join((LINES[1], LINES[2] + "7")), "not one set of two lines"),
         (
             "\n".join((LINES[1], LINES[2][:-1] + "8")),
             "element line 2: its digits add up to 7, not 8",

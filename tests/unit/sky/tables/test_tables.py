@@ -212,6 +212,28 @@ def test_repeated_and_impossible_rows_are_counted(tmp_path, caplog):
     assert catalog.notes[0].endswith(counts)
 
 
+def test_rows_that_are_no_star_repeat_no_identifier_and_a_whole_table_says_nothing(
+    tmp_path, caplog
+):
+    head = "source_id,ra_deg,dec_deg,v_mag,bv_mag\n"
+    whole = ["17,1,2,5.0,0.3", "18,3,4,6.0,0.5", "19,5,6,7.0,0.7"]
+    (tmp_path / "whole.csv").write_text(head + "\n".join(whole) + "\n")
+    read_stars(tmp_path / "whole.csv")
+    assert caplog.text == ""
+    (tmp_path / "dark.csv").write_text(head + "\n".join([*whole, "18,7,8,,0.2"]) + "\n")
+    read_stars(tmp_path / "dark.csv")
+    assert "not used: 1 without a magnitude" in caplog.text
+    assert "identifier" not in caplog.text
+
+
+def test_a_hip_number_is_the_brightest_star_s_of_the_rows_that_are_stars(tmp_path):
+    """The brightest row that has the number has no colour, and is no star."""
+    text = "hip,ra_deg,dec_deg,v_mag,bv_mag\n7,1,2,3.0,\n7,3,4,5.0,0.2\n7,5,6,6.0,0.3\n"
+    (tmp_path / "t.csv").write_text(text)
+    stars = read_stars(tmp_path / "t.csv")
+    assert stars.v_mag[stars.hip == 7].tolist() == [5.0]
+
+
 def sky(count: int) -> Table:
     rng = np.random.default_rng(4)
     return Table(

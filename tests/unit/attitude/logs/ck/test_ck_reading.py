@@ -233,6 +233,24 @@ def test_segments_that_touch_join_where_they_agree_and_break_where_they_do_not(
     assert angle_between_rad(found.q[4], other.quaternion(3.0)) < 60 * MAS
 
 
+def test_an_instant_at_the_end_of_another_segment_is_there_once(kernels_folder, motion):
+    with ck.new_ck(kernels_folder / "a.bc") as handle:
+        ck.write_segment(handle, 3, motion, TIMES[:5])
+        ck.write_segment(handle, 3, motion, TIMES[4:5])
+    found, _ = read_ck(kernels_folder / "a.bc")
+    assert seconds_of(found) == pytest.approx(TIMES[:5], abs=1e-6)
+    assert not found.breaks.any()
+
+
+def test_where_two_segments_touch_the_rate_is_the_later_one_s(kernels_folder, motion):
+    with ck.new_ck(kernels_folder / "a.bc") as handle:
+        ck.write_segment(handle, 3, motion, TIMES[:5], rates=False)
+        ck.write_segment(handle, 3, motion, TIMES[4:9])
+    found, _ = read_ck(kernels_folder / "a.bc")
+    assert seconds_of(found) == pytest.approx(TIMES[:9], abs=1e-6)
+    assert np.isfinite(found.rate).all(axis=1).tolist() == [False] * 4 + [True] * 5
+
+
 def test_the_later_segment_has_priority_where_two_overlap(kernels_folder, motion):
     other = ck.Motion(np.random.default_rng(5))
     with ck.new_ck(kernels_folder / "a.bc") as handle:

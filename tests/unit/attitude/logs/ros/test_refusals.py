@@ -16,6 +16,7 @@ from tests.support.sources.ros_bags import START_NS
 from tests.support.sources.ros_poses import (
     MAKE,
     fixed_transform,
+    moved_transform,
     pose,
     poses,
     recorded_in_turn,
@@ -72,6 +73,11 @@ FRAMES = [
         "refer to east, north, up; give the place with --place LAT,LON,HEIGHT",
     ),
     (UNDATED, ENU, "begin at 0 s, no date; give --epoch-utc TIME"),
+    (
+        poses("map", rotations(3), start_ns=10**6 * 10**9),
+        ENU | {"epoch_utc": "2262-04-11T00:00:00"},
+        "--epoch-utc 2262-04-11T00:00:00: UTC goes from 1677-09-22 to 2262-04-11",
+    ),
     (
         poses("map", rotations(3)),
         ENU | {"epoch_utc": "2025-11-22T08:26:35"},
@@ -151,6 +157,11 @@ TREES = [
         [fixed_transform("base", "cam", (0.5, 0, 0, 0)), *tree([("icrs", "base", rotations(3))])],
         {"body": "cam"},
         "the transform base -> cam has a quaternion whose norm is off by 0.5",
+    ),
+    (
+        [*tree([("icrs", "base", rotations(3))]), moved_transform("icrs", "base", (2, 0, 0, 0))],
+        {"body": "base"},
+        "transform 4 of icrs -> base: .*norm is 2;",
     ),
     (
         CHAIN,

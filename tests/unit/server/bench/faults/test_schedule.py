@@ -205,6 +205,12 @@ def test_an_exposure_is_cut_where_a_fault_begins_ends_or_is_renewed():
         assert timetable(rays).edges_ns(begin_ns, begin_ns + 15 * 10**7) == wanted_ns
 
 
+def test_a_fault_s_number_at_a_moment_is_its_place_in_the_scenario():
+    faults = blank("waits"), blank("first", at_s=0.0), blank("second", at_s=0.0)
+    numbers = {now.fault.name: now.number for now in timetable(*faults).on(0)}
+    assert numbers == {"first": 2, "second": 3}
+
+
 def freeze(name, **keys):
     return fault_of({"kind": "freeze", "name": name, **keys})
 

@@ -268,6 +268,19 @@ def test_what_is_no_omm_is_refused_in_one_line(text):
         read_satellites(text, "omm", UTC_NS)
 
 
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (json.dumps([FIELDS, 3]), "element set 2 is no JSON object"),
+        (json.dumps([FIELDS, FIELDS | {"OBJECT_NAME": "X"} | {"EPOCH": ""}]), r"2 \(X\): EPOCH is"),
+        (as_kvn(FIELDS) + as_kvn(FIELDS | {"BSTAR": "b"}), r"element set 2 \(ISS.*: BSTAR is b;"),
+    ],
+)
+def test_the_wrong_one_of_several_sets_is_named_by_its_number(text, said):
+    with pytest.raises(InputError, match=said):
+        read_satellites(text, "omm", UTC_NS)
+
+
 def test_a_header_in_small_letters_is_told_what_it_lacks():
     header, rows = as_csv(FIELDS).split("\n", 1)
     with pytest.raises(InputError, match="omm: element set 1: EPOCH is missing"):

@@ -33,6 +33,25 @@ def test_a_cable_s_faults_add_up_to_every_packet_at_most(lost, corrupted, reorde
     assert refused.returncode == 2 and words in refused.stderr
 
 
+@pytest.mark.parametrize(
+    ("rate", "words"),
+    [
+        ("0.001", None),
+        ("10000", None),
+        ("0.0009", "--rate 0.0009: write packets per second, 0.001 to 10000"),
+        ("10001", "--rate 10001: write packets per second, 0.001 to 10000"),
+    ],
+)
+def test_packets_leave_from_one_in_a_thousand_seconds_to_ten_a_millisecond(rate, words):
+    to = f"udp://127.0.0.1:{free_port()}"
+    spin = ("send", "--spin", "z,0", "--to", to, "--wait", "0", "--duration", "0.0001", "--json")
+    sent = run_hilstar_here(*spin, "--rate", rate)
+    if words is None:
+        assert json.loads(sent.stdout)["packets"] == 1
+    else:
+        assert sent.returncode == 2 and words in sent.stderr
+
+
 @pytest.mark.parametrize(("duration", "packets"), [("0.1", 3), ("0.04", 2)])
 def test_a_duration_counts_from_the_log_s_first_sample_and_ends_before_its_end(
     tmp_path, duration, packets

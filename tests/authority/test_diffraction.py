@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,6 +28,12 @@ BASE = {
     "points": 1,
     "half_px": 4,
 }
+
+
+@pytest.fixture(scope="module", autouse=True)
+def poppy() -> Any:
+    """Every test here needs it; to import it takes 0.3 s, which no other test has to wait for."""
+    return pytest.importorskip("poppy")
 
 
 def diffraction_image(per_px: int = 8, **keys) -> np.ndarray:
@@ -58,7 +65,7 @@ def test_a_round_pupil_has_the_airy_pattern_and_its_share_outside_the_stamp(obst
 TERMS = {5: 60.0, 7: 80.0, 8: -50.0, 11: 40.0}
 
 
-def test_zernike_terms_are_those_of_poppy_s_own_optical_system():
+def test_zernike_terms_are_those_of_poppy_s_own_optical_system(poppy):
     """poppy turns an image of its own right side up; here y is down, and with it the terms'
     sines.
     """

@@ -45,7 +45,7 @@ LANGUAGES = {"console", "python", "toml", "json", "text", "c"}
 DEFAULT_PORTS = ("5560", "5570", "5580", "8765")
 LISTEN = "0A"  # a state of /proc/net/tcp
 # Of a live run whose figures vary: ten seconds have the same lines, and hold a worker up.
-MAX_DURATION_S = 3.0
+MAX_DURATION_S = 2.0
 # Of one whose ledger is assessed: 80 frames, of which 30 have to be answered.
 MAX_ASSESSED_S = 8.0
 TRACKER_LISTENS = "waiting for frames"

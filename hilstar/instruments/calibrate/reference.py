@@ -297,29 +297,41 @@ class _Unknowns:
     def residuals(self, parameters: FloatArray) -> FloatArray:
         """Readings less the fit (2 n,), rad: along azimuth, then elevation, of each."""
         from_mon, from_cube = self._rotations(parameters)
-        stations = list(self.zeros)
-        links = list(self.links)
-        first_link = 6 + len(stations) - 1
+        zeros = self._zeros(parameters)
+        links = self._link_angles(parameters)
         residual = np.zeros(2 * len(self.readings))
         for k, reading in enumerate(self.readings):
-            place = stations.index(reading.station)
-            zero = self.zeros[reading.station]
-            # the first station's zero is every azimuth's
-            if place:
-                zero = zero + parameters[5 + place]
+            zero = zeros[reading.station]
             if reading.direction is None:
-                at = first_link + 2 * links.index(reading.target)
-                model = _moved(self.links[reading.target], *parameters[at : at + 2])
+                azimuth, elevation = links[reading.target]
             elif reading.target == DOT:
-                model = from_mon @ reading.direction
+                azimuth, elevation = _angles(from_mon @ reading.direction)
             else:
-                model = from_cube @ reading.direction
-            azimuth, elevation = _angles(model)
+                azimuth, elevation = _angles(from_cube @ reading.direction)
             turn = math.remainder(reading.azimuth_rad - (azimuth - zero), 2 * math.pi)
             # along azimuth: a circle is smaller the higher it is
             residual[2 * k] = turn * math.cos(reading.elevation_rad)
             residual[2 * k + 1] = reading.elevation_rad - elevation
         return residual
+
+    def _zeros(self, parameters: FloatArray) -> dict[str, float]:
+        """Each station's azimuth zero, rad."""
+        zeros = {}
+        for place, (station, zero) in enumerate(self.zeros.items()):
+            # the first station's zero is every azimuth's
+            if place:
+                zero = zero + float(parameters[5 + place])
+            zeros[station] = zero
+        return zeros
+
+    def _link_angles(self, parameters: FloatArray) -> dict[str, tuple[float, float]]:
+        """Each link's azimuth and elevation, rad."""
+        first_link = 6 + len(self.zeros) - 1
+        moves = parameters[first_link:].reshape(-1, 2).tolist()
+        angles = {}
+        for (target, direction), (right_rad, up_rad) in zip(self.links.items(), moves, strict=True):
+            angles[target] = _angles(_moved(direction, right_rad, up_rad))
+        return angles
 
     def _rotations(self, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The matrices (3, 3) from mon and from the cube to the theodolite's axes."""
@@ -349,8 +361,9 @@ class _Unknowns:
 
 def _angles(direction: FloatArray) -> tuple[float, float]:
     """Azimuth and elevation, rad, of a direction (3,)."""
-    azimuth = math.atan2(direction[1], direction[0])
-    elevation = math.asin(max(-1.0, min(1.0, -direction[2])))
+    north, east, down = direction.tolist()
+    azimuth = math.atan2(east, north)
+    elevation = math.asin(max(-1.0, min(1.0, -down)))
     return azimuth, elevation
 
 

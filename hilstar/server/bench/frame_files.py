@@ -38,7 +38,6 @@ FITTED, HELD_OUT = 28, 25
 
 Keywords = dict[str, str | float]
 PNG_GREY, PNG_RGB = 0, 2  # colour types
-PNG_LEVEL = 1  # 6 takes twelve times as long for a noisy frame and saves 5 %
 PREVIEW_RADIUS_PX = 9  # of the brightest star's disc
 PREVIEW_BLUR_PX = 0.7
 PREVIEW_POWER = 0.35
@@ -336,7 +335,10 @@ def png_of(image: npt.NDArray[Any], meant_bits: int | None = None) -> bytes:
     chunks = [(b"IHDR", header)]
     if meant_bits is not None:
         chunks.append((b"sBIT", bytes([meant_bits] * channels)))
-    chunks.append((b"IDAT", zlib.compress(scanlines.data, PNG_LEVEL)))
+    # Noise repeats nothing but by chance: to look for runs of one byte alone takes a third to nine
+    # tenths of the time of zlib's quickest level, by the noise, and at most 7 % more bytes.
+    deflate = zlib.compressobj(strategy=zlib.Z_RLE)
+    chunks.append((b"IDAT", deflate.compress(scanlines.data) + deflate.flush()))
     chunks.append((b"IEND", b""))
     file = io.BytesIO()
     png.write_chunks(file, chunks)

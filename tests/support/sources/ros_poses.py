@@ -53,6 +53,13 @@ def fixed_transform(parent: str, child: str, q: Sequence[float], release: str = 
     return "/tf_static", ros_bags.TF, START_NS, message
 
 
+def moved_transform(parent: str, child: str, q: Sequence[float]) -> Sent:
+    """A transform of a frame that moves, 10 s after the start."""
+    make = Make("jazzy")
+    t_ns = START_NS + 10**10
+    return "/tf", ros_bags.TF, t_ns, make.tf(make.transform_stamped(t_ns, parent, child, q))
+
+
 def tree(
     dynamic: Sequence[tuple[str, str, Sequence[Rotation]]],
     fixed: Sequence[tuple[str, str, Rotation]] = (),

@@ -125,7 +125,7 @@ def test_uniformity_is_bilinear_between_the_middles_of_its_fields(write):
     assert light == pytest.approx(plane / plane.max(), rel=1e-6)
 
 
-NOISE = "[weights]\nr = 2\ng = 5\nb = 1\n[noise]\nrelative = 0.013\n"
+NOISE = "[weights]\nr = 2\ng = 5\nb = 1\n[noise]\nrelative = 0.0135724\n"
 ERRORS = """[errors]
 light = [0.5, 1.0]
 off = [0.01, -0.02]
@@ -255,6 +255,8 @@ def test_what_is_not_there_or_not_text_is_refused(tmp_path, write):
     assert "UTF-8" in refusal(tmp_path / "bytes.toml")
     path = write(HEAD + '[uniformity]\nfile = "grid.csv"\n', grid="1.0,0\n")
     assert "no light" in refusal(path)
+    path = write(HEAD + '[uniformity]\nfile = "grid.csv"\n', grid="1.0,1\n0.9,x\n")
+    assert "grid.csv:2: column 2 = 'x' is not a finite number" in refusal(path)
     assert "add [weights]" in refusal(write(), bit_stealing=True)
     assert "the monitor has 10" in refusal("lcd-example", bits=10)
 

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilstar.display.exact import ExactQuantiser, Turn
+from hilstar.display.balance import SUMS
+from hilstar.display.exact import OFF, ExactQuantiser, Turn, _turn_one_more
 from hilstar.display.footprints import LEAST_LIGHT, FootprintMap, PixelOrder, star_losses_mag
 from hilstar.display.panel import Panel
 from hilstar.display.quantise import round_levels, shown_light
@@ -469,3 +470,23 @@ def test_a_star_s_choice_is_among_nine_pixels_at_least_and_all_near_ones_at_most
     assert order.near_sigmas(0.6) - order.near_sigmas() == pytest.approx(
         0.6 / np.sqrt(variance_px2.min())
     )
+
+
+@pytest.mark.parametrize(("off", "turned"), [(-OFF - 0.01, 1), (OFF + 0.01, 0), (OFF - 0.01, None)])
+def test_a_star_that_is_a_step_off_has_one_pixel_turned_that_can_be(off, turned):
+    """Of three pixels of equal steps the first is up, the second is not, and the last has no step:
+    light that is missing is added by the second, and light that is too much taken from the first,
+    though turning another would change the other sums less.
+    """
+    step = np.array([[1.0], [1.0], [0.0]], dtype=np.float32)
+    arm = np.ones((SUMS, 3, 1), dtype=np.float32)
+    arm[1:, turned or 0] = 3.0  # the one that is wanted costs more
+    up = np.array([[True], [False], [False]])
+    error = np.zeros((SUMS, 1), dtype=np.float32)
+    error[0] = off
+    _turn_one_more(step, arm, up, error, np.ones(1, dtype=np.float32))
+    wanted = np.array([True, False, False])
+    if turned is not None:
+        wanted[turned] ^= True
+        assert error[0] == pytest.approx(off - np.sign(off), abs=1e-6)
+    assert up[:, 0].tolist() == wanted.tolist()

@@ -12,6 +12,7 @@ from hilstar.display.geometry import KIND, ErrorTable, load_geometry
 from hilstar.display.primaries import read_ccss
 from hilstar.display.render.way import WAY_VARIABLE, wanted_way
 from hilstar.optics.psf import GaussianPsf
+from hilstar.sky.spectrum import RANGE_NM
 from tests.support.refusals import assert_file_refused, refusal, says
 from tests.support.stars import sprites_at
 
@@ -103,6 +104,8 @@ SPECTRA = [
     (ccss([*COLOURS[:2], [0.0] * 4]), ": 2 samples with light, where three primaries are wanted"),
     (ccss(COLOURS, bands=5), ": 3 samples of 4 bands; "),
     (ccss(COLOURS, ends=(700, 400)), ": 3 samples of 4 bands; "),
+    (ccss(COLOURS, ends=(RANGE_NM[0], 700)), ": 3 samples of 4 bands; "),
+    (ccss(COLOURS, ends=(400, RANGE_NM[1])), ": 3 samples of 4 bands; "),
     (ccss([*COLOURS[:2], [0.0, float("nan"), 1.0, 0.0]]), ": 3 samples of 4 bands; "),
     (ccss(COLOURS).replace("SPECTRAL_BANDS", "BANDS"), ": 'SPECTRAL_BANDS' is wrong or missing; "),
 ]

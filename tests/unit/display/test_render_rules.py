@@ -32,7 +32,7 @@ from hilstar.display.render.encoder import (
 from hilstar.display.render.light_units import DENSER_WINGS, MAX_SUM, LightUnits
 from hilstar.display.render.numpy_backend import NumpyBackend, headless_context
 from hilstar.display.render.presenter import checked_triples, drawn_codes
-from hilstar.display.render.reference import linear_image
+from hilstar.display.render.reference import add_stars, linear_image
 from hilstar.display.render.target import SpriteSide, Target
 from hilstar.display.response import Levels, gamma_response
 from hilstar.optics.psf import GaussianPsf
@@ -503,3 +503,15 @@ def test_a_buffer_is_read_from_its_bottom_row_and_compared_from_its_top():
     codes = np.arange(2 * 3 * 3).reshape(3, 2, 3)  # three rows of two pixels
     read = (codes / 255).astype(np.float32)[::-1].tobytes()
     np.testing.assert_array_equal(drawn_codes(read, (2, 3), 8), codes)
+
+
+def test_a_share_of_some_sprites_is_added_to_what_an_image_has():
+    """A quarter of the light of two of three."""
+    sprites = sprites_at(
+        np.array([[9.0, 8.0], [20.0, 15.0], [30.0, 22.0]]),
+        np.array([4.0, 8.0, 16.0]),
+        PSF.footprint_px,
+    )
+    image = np.full((32, 48), 0.5)
+    add_stars(image, sprites, PSF, PSF.footprint_px, np.array([0, 2]), 0.25)
+    assert (image - 0.5).sum() == pytest.approx(0.25 * (4.0 + 16.0), rel=1e-4)

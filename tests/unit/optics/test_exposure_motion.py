@@ -14,6 +14,7 @@ from hilstar.optics.exposure_motion import MIDDLE_S, Motion, smeared_sprites
 from hilstar.optics.psf import MAX_CUT, GaussianPsf
 from hilstar.optics.scan import Scan
 from hilstar.optics.sprites import join_sprites, make_sprites
+from tests.support.refusals import refusal
 from tests.support.stars import stars_at
 from tests.support.turned_cameras import turned_attitude, turned_cameras
 
@@ -170,6 +171,42 @@ def test_a_turn_too_long_to_draw_is_refused_with_what_can_be(rate):
         InputError, match=r"turns by .* deg is too long; at most .* deg can be drawn"
     ):
         smeared_sprites(star_on((160.2, 120.7), motion((0, 0, 0))), at, CAMERA, GaussianPsf(SIGMA))
+
+
+def longest_turn_deg(sigma_px: tuple[float, float]) -> float:
+    """What the refusal of a turn about the boresight of 10 revolutions says can be drawn."""
+    at = motion((0, 0, 3600.0))
+    line = refusal(smeared_sprites, star_on((160.2, 120.7), at), at, CAMERA, GaussianPsf(sigma_px))
+    return float(line.partition("at most ")[2].partition(" deg")[0])
+
+
+def test_a_turn_as_long_as_its_refusal_says_is_drawn_and_a_longer_one_is_not(monkeypatch):
+    """The narrower axis of the PSF limits it, whichever that is."""
+    monkeypatch.setattr(smear, "MAX_PIECES", 6)
+    said_deg = longest_turn_deg(SIGMA)
+    for sigma_px in ((0.6, 0.85), (0.6, 0.6)):
+        assert longest_turn_deg(sigma_px) == pytest.approx(said_deg)
+    just_drawn, too_long = (motion((0, 0, 0.999 * said_deg)), motion((0, 0, 1.002 * said_deg)))
+    psf = GaussianPsf(SIGMA)
+    assert len(smeared_sprites(star_on((160.2, 120.7), just_drawn), just_drawn, CAMERA, psf)) > 1
+    star = star_on((160.2, 120.7), too_long)
+    assert "is too long" in refusal(smeared_sprites, star, too_long, CAMERA, psf)
+
+
+@pytest.mark.parametrize("down_px_s", [200.0, -200.0])
+def test_a_star_that_goes_with_the_shutter_is_exposed_for_longer(down_px_s):
+    """Rows begin a millisecond apart. A star that stays exposed from row to row has 1 / (1 - v row_s)
+    of the light that it has at rest, v its speed along the scan.
+    """
+    scan = Scan((0, 1), scanout_s=0.24)
+    row_s = scan.scanout_s / SIZE[1]
+    at = motion((np.degrees(down_px_s / CAMERA.focal_length_px), 0, 0), 0.1)
+    stars = star_on((CAMERA.principal_point_px[0], 120.0), at)
+    drawn = smeared_sprites(stars, at, CAMERA, GaussianPsf(SIGMA), scan)
+    moved_px_s = np.sign(drawn.y_px[-1] - drawn.y_px[0]) * abs(down_px_s)
+    light = drawn.data["electrons_per_s"].sum(dtype=np.float64)
+    # 10 px off the principal point its speed is another by (10 px / focal length)^2: 3e-6
+    assert light == pytest.approx(1 / (1 - moved_px_s * row_s), rel=1e-5)
 
 
 def test_more_sprites_than_the_bound_are_made_fewer_with_their_light_kept(monkeypatch, rng):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -214,6 +216,26 @@ def test_a_large_disc_is_moved_with_its_camera_and_hides_at_the_middle_of_its_po
     assert [(part.times, part.covers) for part in drawn] == [(share, False) for share in shares]
     assert [part.icrs_to_image for part in drawn] == turns
     assert len(disc_lights(disc, DiscView(CAMERA, PSF, poses), False)) == 3
+
+
+def test_a_disc_is_spread_along_each_axis_by_its_own_sigma_and_hides_what_it_covers():
+    psf = GaussianPsf((0.8, 1.6))
+    light = DiscLight(uniform_disc((40.0, 30.0), 6.0), np.eye(3), CAMERA, psf)
+    image = extended_image((light,), SIZE_PX)
+    rows, columns = np.indices(image.shape)
+    variances = []
+    for axis in (columns, rows):
+        mean = np.average(axis, weights=image)
+        variances.append(np.average((axis - mean) ** 2, weights=image))
+    # beside the Gaussian's they have the disc's own, 9 px^2, alike to a thousandth
+    assert variances[1] - variances[0] == pytest.approx(1.6**2 - 0.8**2, abs=0.01)
+    even = LightMap(np.ones(SIZE_PX[::-1], np.float32))
+    for covers, behind in ((True, 0.0), (False, 1.0)):
+        dark = replace(light, times=0.0, covers=covers)
+        seen = extended_image((even, dark), SIZE_PX)
+        # 6 px are 3.75 sigmas of the wider axis
+        assert seen[30, 40] == pytest.approx(behind, abs=1e-3)
+        assert seen[0, 0] == 1.0
 
 
 def test_light_times_a_factor_has_so_much_more_of_it_and_hides_as_much():

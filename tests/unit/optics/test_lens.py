@@ -52,6 +52,16 @@ def test_every_direction_on_the_screen_is_within_the_cull_and_none_behind_it_com
     assert np.isnan(camera.places_px(far, np.zeros(50))[0]).all()
 
 
+def test_a_pixel_beyond_the_lens_has_no_direction():
+    """Of a lens that ends at a tangent of 0.1, up to just beyond it and far from it."""
+    camera = replace(PINHOLE, lens=Lens((0.6, 0.0, 0.0), max_tangent=0.1))
+    x_px, y_px = replace(PINHOLE, lens=Lens((0.6, 0.0, 0.0))).places_px(
+        np.array([0.0, 0.0999, 0.1001, 0.15]), np.zeros(4)
+    )
+    u, v = camera.tangents(x_px, y_px)
+    assert np.isnan(u).tolist() == np.isnan(v).tolist() == [False, False, True, True]
+
+
 def test_the_terms_of_a_residual_field_rise_first_along_rows_as_files_have_them():
     """T_i of the column times T_j of the row, from -1 at an edge of the outer pixel to 1 at the
     other: T0T0, T0T1, T0T2, T1T0, T1T1, T2T0. A field of each term alone has that term.

@@ -91,8 +91,14 @@ def test_a_map_is_known_by_its_content(tmp_path):
 
 AT = np.arange(-6, 7) / 3
 ROUND = np.exp(-(AT[:, None] ** 2 + AT**2) / 0.8)
+# Each second sample along x or y: a star in a pixel's middle gets a tenth of one at its edge.
+STRIPES = np.where(np.arange(-6, 7) % 2, 1.0, 0.1)
 PSFS = [
     (b"no FITS", ": ...not a FITS image"),
+    *(
+        (fits_bytes(stripes, OVERSAMP=2, PIXINT=True), ": ...% of a PSF's light at one place in a")
+        for stripes in (np.outer(np.ones(13), STRIPES), np.outer(STRIPES, np.ones(13)))
+    ),
     (fits_bytes(None), ": not a FITS image"),
     (fits_bytes(np.stack([ROUND, ROUND]), OVERSAMP=3), ": holds 2 images, and one PSF is drawn"),
     (fits_bytes(ROUND, OVERSAMP=3)[:3000], ": not a FITS image"),

@@ -91,6 +91,9 @@ def test_whole_refreshes_cure_the_light_of_a_panel_that_flashes_and_not_its_plac
         )
     one_or_two = beat(Exposures(60.0, 1.5 / 60, lit_s=0.0))
     assert one_or_two.worst_mag == pytest.approx(2.5 * math.log10(1.5), rel=1e-3)
+    # one flash or two of the mean's 1.2: more are further from it than fewer
+    few_or_many = beat(Exposures(60.0, 1.2 / 60, lit_s=0.0))
+    assert few_or_many.worst_mag == pytest.approx(2.5 * math.log10(2 / 1.2), rel=1e-3)
     assert beat(Exposures(60.0, 0.5 / 60, lit_s=0.0)).worst_mag == math.inf
 
 

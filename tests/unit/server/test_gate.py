@@ -263,10 +263,12 @@ def test_a_good_display_passes_and_its_swaps_are_predicted_from_the_last_one(tmp
 
 
 def test_a_fault_is_refused_and_only_logged_with_force(tmp_path, caplog):
-    screen, display = model_screen(tmp_path, composited=True)
+    screen, display = model_screen(tmp_path, composited=True, scaled=True)
     with pytest.raises(MachineError, match=r"compositing.*or add --force"):
         pass_gate(screen, force=False, clock=display.clock)
     pass_gate(screen, force=True, clock=display.clock)
+    compositing, scale = screen.forced
+    assert "compositing manager" in compositing and "scaled by its desktop" in scale
     assert "shown anyway (--force)" in caplog.text
 
 

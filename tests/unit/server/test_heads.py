@@ -86,13 +86,16 @@ def test_a_head_that_a_command_s_exit_code_ends_has_done(tmp_path, code, exit_co
 
 def test_what_a_head_says_is_told_with_its_name_and_secrets_are_in_its_environment(tmp_path):
     lines: list[str] = []
-    code = f"{READY} import sys; print(os.environ['HILSTAR_TOKEN'], file=sys.stderr)"
+    code = (
+        f"{READY} import sys; print(os.environ['HILSTAR_TOKEN'], file=sys.stderr);"
+        " print(os.environ['WATCHDOG_USEC'], file=sys.stderr)"
+    )
     token = {"HILSTAR_TOKEN": "secret"}
     head = HeadProcess(
         "head", lambda number, drawn_s: python(code), lines.append, tmp_path / "life", token
     )
     assert ended(head) == (0, 0)
-    assert lines == ["head: secret"]
+    assert lines == ["head: secret", f"head: {1e6 * heads.STALLED_S:.0f}"]
     assert "HILSTAR_TOKEN" not in os.environ
 
 
@@ -272,6 +275,18 @@ def test_the_common_source_gives_the_body_s_attitude(tmp_path):
     config = heads.source_config(file)
     assert config.tracker.q_body_to_cam == (1.0, 0.0, 0.0, 0.0)
     assert config.attitude == file.files[0].config.attitude
+
+
+def test_a_head_that_has_not_drawn_yet_has_the_time_of_a_start(tmp_path, monkeypatch):
+    lines: list[str] = []
+    head = HeadProcess(
+        "head", lambda *words: python("import time; time.sleep(60)"), lines.append, tmp_path / "l"
+    )
+    monkeypatch.setattr(heads, "STALLED_S", -1.0)  # any time is too long
+    assert head.tend() and lines == []
+    monkeypatch.setattr(heads, "STARTS_S", -1.0)
+    assert head.tend() and "it is started again" in lines[0]
+    head.close(1.0)
 
 
 def test_a_head_without_a_sign_of_life_is_killed_and_begun_again(tmp_path, monkeypatch):

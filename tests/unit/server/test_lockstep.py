@@ -6,18 +6,21 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import hilstar
+from hilstar.attitude.receiver import PacketCounts
 from hilstar.attitude.wire import protocol
 from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, TimeRequest
 from hilstar.attitude.wire.source import PACKETS
 from hilstar.basics.rotation import from_rotation_vector
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
+from hilstar.basics.wrong_sky import RATES
 from hilstar.server.loop import FrameLoop, Limit
 from hilstar.server.pacer import Pacer, Presented
 from hilstar.server.serve import LockstepRun, Outlet
@@ -126,6 +129,24 @@ def test_each_attitude_is_drawn_at_once_at_the_simulation_s_own_time(run):
     assert (done.summary.frames, done.summary.packets.accepted) == (3, 3)
     assert done.summary.turn_ms.p50 == pytest.approx(TURN_MS, rel=2e-3)
     assert [record.frame for record in done.kept.frames] == [0, 1, 2]
+
+
+def test_a_frame_is_seen_from_where_the_simulation_s_craft_is_and_goes(run):
+    moving = replace(sample(1, 10), velocity_km_s=np.array([0.0, 7.5, 1.0]))
+    there = replace(moving, place_km=np.array([7000.0, -20.0, 1.0]))
+    (record,) = run(there).kept.frames
+    assert (record.velocity_km_s, record.place_km) == ((0.0, 7.5, 1.0), (7000.0, -20.0, 1.0))
+
+
+def test_a_wrong_sky_counts_from_a_run_s_first_frame(small_bench):
+    clock = FakeClock()
+    loop = FrameLoop(small_bench, pacer=SlowPacer(NS_PER_S / REFRESH_HZ, clock))
+    outlet = Outlet(notices=loop.notices)
+    loop.notices.begin(RATES, "too fast", since_ns=clock.ns)
+    loop.tally.first_swap_ns = clock.ns + 2 * NS_PER_S
+    clock.work(5 * NS_PER_S)
+    summary = loop.tally.summary(3.0, PacketCounts(), small_bench.renderer)
+    assert outlet.complete(summary, loop).wrong_sky.seconds == pytest.approx(3.0)
 
 
 def test_a_refused_request_leaves_the_last_frame_and_is_recorded_with_its_reason(run):

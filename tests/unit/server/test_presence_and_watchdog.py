@@ -46,6 +46,7 @@ def test_an_attitude_that_goes_stale_is_told_with_its_age_and_when_it_is_fresh_a
     clock = FakeClock()
     watch = AttitudeWatch(notices, clock)
     watch.see(FRESH, False)
+    clock.work(7e9)
     for _ in range(3):
         watch.see(OLD, True)
         clock.work(1e9)

@@ -115,7 +115,7 @@ def test_a_log_begins_at_0_and_a_rate_that_it_lacks_is_the_turn_to_the_next_samp
 def test_a_rate_between_two_of_a_log_is_between_theirs_and_none_crosses_a_break():
     """At a third of the way a third of the change; behind a break the log begins anew."""
     rates = [[0.0, 0.0, 0.0], [0.3, -0.6, 0.9], [3.0, 0.0, 0.0], [3.0, 0.0, 0.0]]
-    samples = list(log_samples(turning([0.0, 0.3, 0.6, 0.9], rates, breaks={2}), 10.0))
+    samples = list(log_samples(turning([0.0, 0.3, 0.6, 0.9], rates, breaks={0, 2}), 10.0))
     assert [sample.t_ns for sample in samples] == [k * NS_PER_S // 10 for k in range(10)]
     rate = [sample.rate_cam_rad_s for sample in samples]
     assert rate[1] == pytest.approx([0.1, -0.2, 0.3])

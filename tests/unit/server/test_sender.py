@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
+from hilstar.attitude.wire.keys import CurveKeys
 from hilstar.attitude.wire.packet import AttitudeSample, decode
 from hilstar.server import sender as roads
 from hilstar.server.sender import Sender
@@ -39,6 +41,20 @@ def test_packets_are_numbered_in_their_order_with_the_time_and_rate_given(left):
     sender.close()
     assert "closed" in refusal(sender.send, Q)
     assert len(left) == 3
+
+
+@pytest.mark.parametrize(
+    ("to", "words", "said"),
+    [
+        ("udp://127.0.0.1:0", {}, "write udp://HOST:PORT"),
+        ("udp://127.0.0.1:65536", {}, "write udp://HOST:PORT"),
+        ("udp://127.0.0.1:65535", {"keys": CurveKeys(Path("key"))}, "only ZeroMQ has keys"),
+        ("serial:/dev/null@115200", {"keys": CurveKeys(Path("key"))}, "only ZeroMQ has keys"),
+        ("serial:/dev/null@115200", {"connect": True}, "a side that connects (--connect)"),
+    ],
+)
+def test_where_nothing_can_be_sent_or_what_a_road_has_not_is_refused(to, words, said):
+    assert said in refusal(roads.open_sender, to, **words)
 
 
 @pytest.mark.usefixtures("left")

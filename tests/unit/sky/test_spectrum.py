@@ -20,7 +20,14 @@ from hilstar.sky.electrons import (
     tabulate,
     tabulate_pickles,
 )
-from hilstar.sky.spectral_types import DUST_EBV_MAG, LETTERS, bare_and_dusty, class_shares
+from hilstar.sky.spectral_types import (
+    DUST_EBV_MAG,
+    DUST_MAG,
+    DUST_PER_UM,
+    LETTERS,
+    bare_and_dusty,
+    class_shares,
+)
 from hilstar.sky.spectrum import (
     Curve,
     blackbody_exitance_w_m2_m,
@@ -364,3 +371,14 @@ def test_a_table_s_rate_is_that_of_v_0_and_a_hundredth_of_it_five_magnitudes_on(
     temperature_k = np.array([5000.0, 10_000.0, 5000.0])
     rates = table.electrons_per_s(np.array([0.0, 5.0, -2.5]), temperature_k)
     assert rates == pytest.approx([1e6, 1e2, 1e7], rel=1e-12)
+
+
+def test_dust_is_fitzpatricks_at_his_anchors():
+    """Table 3 of Fitzpatrick 1999 (PASP 111, 63) for R = 3.1: wavelengths, Angstrom, and
+    A / E(B-V).
+    """
+    angstroms = [26_500, 12_200, 6000, 5470, 4670, 4110, 2700, 2600]
+    extinction_mag = [0.265, 0.829, 2.688, 3.055, 3.806, 4.315, 6.265, 6.591]
+    assert DUST_PER_UM[1:] == pytest.approx([1e4 / each for each in angstroms], abs=5e-4)
+    assert DUST_MAG[1:] == pytest.approx(extinction_mag)
+    assert (DUST_PER_UM[0], DUST_MAG[0]) == (0.0, 0.0)

@@ -109,7 +109,7 @@ def test_a_star_is_called_by_its_number_else_by_its_name_in_its_catalogue(rng):
     """In the order in which they are asked for; a star of no catalogue has no name."""
     stars = two_channel_stars(rng)
     sky = with_bodies(stars, ("Moon", "Mars"), np.zeros(2), colours=np.array([0.5, 0.5]))
-    added = np.flatnonzero((sky.row == 10) & (sky.hip == 0))
+    (added,) = np.flatnonzero((sky.row == 9) & (sky.hip == 0))
     sky.row[added] = -1
     asked = np.array([COUNT + 1, *(COUNT - 1 - np.arange(COUNT)), COUNT])
     names, designations = ["Mars"], ["Mars"]

@@ -400,7 +400,7 @@ class PixelScatter:
                 if not patch.code:
                     squares = squares + others
         if squares:
-            return float(np.mean(squares))
+            return sum(squares) / len(squares)  # of a handful NumPy's mean takes ten times as long
         return 0.0
 
     def dark_sum_dn(self, times: int) -> float:

@@ -30,9 +30,9 @@ WIDE_ARCSEC2 = np.full(3, 1e12)  # a field of any size: the prior of the clock a
 TRIES = 300
 # binomial: of 300 bounds at 97.5 %, 283 and fewer hold once in 1000
 MIN_HELD = 284
-# Of an interval of 95 %, of 12 two and more miss once in nine, four and more once in 500; of one
-# that held in a quarter of runs, nine and more of 12 do once in 2500.
-RUNS, MIN_RUNS_HELD = 12, 9
+# Of an interval of 95 %, of 8 three and more miss once in 170; of one that held in a quarter of
+# runs, six and more of 8 do once in 240.
+RUNS, MIN_RUNS_HELD = 8, 6
 
 
 def swing() -> FloatArray:

@@ -42,9 +42,11 @@ from hilstar.instruments.calibrate.attitude_pairs import (
     RotationFit,
     _angles_to,
     _weights,
+    pair_with_ledger,
 )
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import bench_text
+from tests.support.planted_run import write_ledger
 from tests.support.refusals import refusal
 
 CAMERA = monitor_camera(
@@ -221,6 +223,14 @@ def wild_half(rng: np.random.Generator, reported: np.ndarray) -> np.ndarray:
     return np.concatenate([commanded_of(rng, 20), reported[20:]])
 
 
+def half_off(rng: np.random.Generator, reported: np.ndarray) -> np.ndarray:
+    """The first half is off by a quarter of a degree, each to a side of its own."""
+    sides = rng.normal(size=(20, 3))
+    sides *= np.radians(0.25) / np.linalg.norm(sides, axis=1, keepdims=True)
+    off = from_rotation_vectors(sides)
+    return np.concatenate([multiply(off, reported[:20]), reported[20:]])
+
+
 TOP = from_rotation_vector(np.array([0.0, np.pi / 2, 0.0]))  # a frame whose z is no boresight
 # What becomes of 40 commanded attitudes and of what a tracker reports of them.
 REFUSED = [
@@ -234,6 +244,9 @@ REFUSED = [
     (lambda c, t: (np.roll(c, -1, axis=1), t), ("commanded", "scalar last")),
     (lambda c, t: (c[[0] * 5], conjugate(t[[0] * 5])), ("inverse",)),
     (lambda c, t: (c, wild_half(np.random.default_rng(2), t)), ("half or more",)),
+    (lambda c, t: (c, half_off(np.random.default_rng(2), t)), ("half or more", "20 of 40 agree")),
+    # by the inverse one rotation would do, but for which the screen is out of view
+    (lambda c, t: (c, conjugate(multiply(TOP, c))), ("half or more",)),
     (lambda c, t: (c, multiply(TOP, c)), ("90 degrees off the boresight",)),
     (lambda c, t: (c[:2], c[:2]), ("2 pairs and 3 are needed",)),
 ]
@@ -407,6 +420,11 @@ def test_an_alignment_s_figures_are_alike_in_lines_summary_and_file(tmp_path, rn
     counts = [summary[name] for name in ("pairs", "used", "wild", "skipped", "attitudes")]
     assert counts == [24, 23, 1, skipped, 12]
     assert summary["wild_rows"] == (7,)
+    for name, axes in (
+        ("repeat", found.residual.repeat),
+        ("unexplained", found.residual.unexplained),
+    ):
+        assert summary[f"{name}_arcsec"] == {"cross": axes.cross, "roll": axes.roll}
     lines = {line[:24].strip(): line[24:] for line in lines_of(found)}
     text = "\n".join(lines_of(found))
     assert "23 of 24 used, of 12 attitudes" in text
@@ -444,3 +462,23 @@ def test_an_alignment_s_figures_are_alike_in_lines_summary_and_file(tmp_path, rn
     np.testing.assert_allclose(
         np.sqrt(np.diag(notes.error.alignment_covariance_arcsec2)), summary["sigma_arcsec"]
     )
+
+
+def test_telemetry_is_paired_by_time_with_what_a_run_commanded(tmp_path):
+    """Frames every 0.1 s for 2 s, turning about y; the tracker's clock is 0.3 s behind. The first
+    row is not valid, and the last is after the run.
+    """
+    t_s = np.arange(21) * 0.1
+    turns = Rotation.from_rotvec(np.outer(0.02 * t_s, [0.0, 1.0, 0.0]))
+    write_ledger(tmp_path / "run.mcap", t_s, turns.as_quat(scalar_first=True))
+    rows = [
+        f"{5 + t - 0.3},1,0,0,0,{valid}" for t, valid in ((0.2, 0), (0.5, 1), (1.25, 1), (2.9, 1))
+    ]
+    (tmp_path / "t.csv").write_text("\n".join(["t_s,qw,qx,qy,qz,valid", *rows]) + "\n")
+    pairs = pair_with_ledger(tmp_path / "t.csv", tmp_path / "run.mcap", 0.3)
+    assert (pairs.line.tolist(), pairs.skipped, pairs.names) == ([3, 4], 2, COMMANDED)
+    wanted = Rotation.from_rotvec(np.outer(0.02 * np.array([0.5, 1.25]), [0.0, 1.0, 0.0]))
+    assert pairs.commanded == pytest.approx(wanted.as_quat(scalar_first=True), abs=1e-6)
+    assert np.abs(pairs.rate_rad_s) == pytest.approx(np.tile([0.0, 0.02, 0.0], (2, 1)), abs=1e-6)
+    line = refusal(pair_with_ledger, tmp_path / "t.csv", tmp_path / "run.mcap", 100.0)
+    assert "meet no frame of" in line and "add --offset-s" in line

@@ -58,7 +58,7 @@ from hilstar.optics.camera import Camera
 from hilstar.server.bench.bench_file import BenchFile
 from tests.support.bench_files import filed_bench
 from tests.support.closed_camera import CLOSED, ClosedCamera
-from tests.support.refusals import refusal
+from tests.support.refusals import assert_file_refused, refusal
 
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 ROUNDING = 1e-9
@@ -350,6 +350,36 @@ def test_dots_closer_than_a_link_are_not_taken_for_one(rng):
     np.testing.assert_allclose(found.y_px, 2 * y - 10, atol=0.2)
 
 
+def test_of_two_places_that_blink_one_dot_s_code_the_one_with_fewer_errors_is_it(rng):
+    """The first of them misses a frame, or the second does."""
+    plan = plan_dots((300, 200), 16, 14, rng)
+    seen = codes_seen(plan, rng)
+    frames = np.flatnonzero(plan.lit[3])
+    for missed, places in (((frames[1:], frames), 1), ((frames, frames[1:]), 0)):
+        x_px = 1000.0 + 100.0 * np.repeat([0, 1], [len(frame) for frame in missed])
+        false = observed(np.concatenate(missed), x_px, np.full(len(x_px), 900.0))
+        others = seen.at(np.flatnonzero(np.abs(seen.x_px - (2 * plan.x_px[3] + 30)) > 1))
+        found = decode(plan, others.joined(false))
+        assert found.x_px[found.dot == 3] == pytest.approx([1000.0 + 100.0 * places])
+
+
+PLANS = [
+    ("0,0,1,2\n-1,0,1,2\n", ":3: '-1,0,1,2'; whole numbers frame and dot"),
+    ("0,-1,1,2\n", ":2: '0,-1,1,2'; whole numbers"),
+    ("1000001,0,1,2\n", ":2: '1000001,0,1,2'; whole numbers"),
+    ("0.5,0,1,2\n", "whole numbers"),
+    ("0,0,inf,2\n", "a dot's place is no number"),
+    ("0,0,1,nan\n", "a dot's place is no number"),
+    ("", "has no dot"),
+]
+
+
+@pytest.mark.parametrize(("rows", "words"), PLANS, ids=range(len(PLANS)))
+def test_what_is_no_plan_of_dots_is_refused(tmp_path, rows, words):
+    (tmp_path / "plan.csv").write_text(f"frame,dot,x_px,y_px\n{rows}")
+    assert_file_refused(read_plan, tmp_path / "plan.csv", f"...{words}")
+
+
 def test_images_are_known_by_the_last_number_of_their_names_and_their_folder_s_pose():
     paths = [Path(name) for name in ("a/x2_003.png", "pose_2/7.png", "POSE1/f12b.png", "f0.png")]
     found = numbered(paths)
@@ -492,3 +522,5 @@ def test_a_dot_is_on_the_screen_to_6_px_from_the_middles_of_its_outermost_pixels
     x_px = np.array([6.0, 5.9, 633.0, 633.1, 300.0, 300.0, 300.0, 300.0])
     y_px = np.array([200.0, 200.0, 200.0, 200.0, 6.0, 5.9, 473.0, 473.1])
     assert seen.shows(x_px, y_px).tolist() == [True, False] * 4
+    lower, upper = seen.box()
+    assert (lower.tolist(), upper.tolist()) == ([EDGE_PX, EDGE_PX], [639 - EDGE_PX, 479 - EDGE_PX])

@@ -127,7 +127,10 @@ def test_readings_are_in_their_file_as_they_are(tmp_path):
     np.testing.assert_allclose(measured.common, readings.common, rtol=1e-4)
     assert measured.code.tolist() == [0, 300, WHITE, 700, 0]
     lines = (tmp_path / "measured.csv").read_text().splitlines()
-    rows = [line.split(",")[:3] for line in lines if not line.startswith("#")]
+    table = [line.split(",") for line in lines if not line.startswith("#")]
+    causes = readings.common.shape[1]
+    assert table[0][3:] == ["value", "sigma", *(f"common_{k}" for k in range(1, causes + 1))]
+    rows = [row[:3] for row in table]
     codes = ["0", "300", str(WHITE), "700", "0"]
     assert rows[0] == ["order", "code", "channel"]
     assert rows[1:] == [[str(order), code, "w"] for order, code in enumerate(codes, start=1)]

@@ -130,6 +130,29 @@ def test_wild_dots_do_not_bend_the_map():
     assert np.std(found.at_dots / true) < 0.002
 
 
+def test_light_that_is_even_has_one_field_as_sure_as_its_dots_are_many():
+    """One number of n dots: their scatter over the root of n. A finer map that is better by chance
+    is not taken.
+    """
+    for seed in range(12):
+        seen = dots(lambda x, y: np.ones_like(x), np.random.default_rng(seed))
+        found = map_of(seen, seen.light, SIZE_PX)
+        assert found.grid.shape == (1, 1)
+        assert found.left_mag == pytest.approx(seen.noise_mag, rel=0.06)
+        assert found.fit_mag == pytest.approx(found.left_mag / np.sqrt(found.used.sum()), rel=1e-6)
+
+
+def test_a_map_s_own_error_goes_with_the_fields_that_its_dots_determine():
+    """The mean square error of a least-squares fit's values is the noise's, times its freedom over
+    the number of dots: more fields than one, and no more than there are.
+    """
+    seen = dots(lambda x, y: 1 - 0.2 * x * y + 0.1 * x**2, np.random.default_rng(1))
+    found = map_of(seen, seen.light, SIZE_PX)
+    freedom = (found.fit_mag / found.left_mag) ** 2 * found.used.sum()
+    assert found.grid.size > 20
+    assert 0.3 * found.grid.size < freedom <= found.grid.size
+
+
 @pytest.mark.parametrize("fall", [0.0, 0.004, 0.012, 0.05])
 def test_unevenness_that_no_map_shows_for_sure_is_in_the_error(fall):
     """Dots over a small part of a screen whose light falls towards its sides, down to less than

@@ -8,19 +8,28 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from hilstar.basics.rotation import from_rotation_vector
+from hilstar.basics.rotation import from_rotation_vector, normalise, to_matrix
+from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.instruments.calibrate.attitude_pairs import _boresight_rad
 from hilstar.instruments.calibrate.camera_edges import check_rate
 from hilstar.instruments.calibrate.first_light.uniformity import _White, light_of_dots
-from hilstar.instruments.calibrate.geometric import match
+from hilstar.instruments.calibrate.geometric import fit, match
 from hilstar.instruments.calibrate.geometric.dots import DotPlan
 from hilstar.instruments.calibrate.geometric.fit import (
+    CENTROIDS_PER_NUMBER,
     HUBER,
+    PINHOLE,
+    POSE_STEP_RAD,
+    STEPS,
     Geometry,
     MatchedDots,
+    Model,
     Nominal,
     Problem,
+    candidates,
+    geometry_of,
     loss_of,
     residuals_sigma,
 )
@@ -224,3 +233,69 @@ def test_a_map_that_less_than_a_third_of_many_dots_fit_is_none(rng, fitting, is_
     assert (found is not None) == is_found
     if is_found:
         np.testing.assert_allclose(found @ [0.05, -0.1, 1.0], [500, -400, 1.0], atol=3.0)
+
+
+def test_a_geometry_is_its_numbers_in_their_steps():
+    """A focal length by the power of e; a principal point about which the camera turns, so that its
+    axis stays on its pixel; and poses that turn after those that were matched.
+    """
+    monitor = Camera((1920, 1080), 6000.0, (950.0, 530.0), np.eye(3))
+    nominal = Nominal(monitor, np.array([1.0, 0.0, 0.0, 0.0]), monitor)
+    rng = np.random.default_rng(3)
+    q_poses = normalise(rng.normal(size=(2, 4)))
+    shift_px, turn_rad = np.array([3.0, -5.0]), rng.normal(size=3)
+    model = Model(("log_focal", "centre_x", "centre_y"), (), 2)
+    numbers = [0.3 / STEPS["log_focal"], *(shift_px / STEPS["centre_x"])]
+    found = geometry_of(model, nominal, q_poses, np.array([*numbers, *(turn_rad / POSE_STEP_RAD)]))
+    assert found.monitor.focal_length_px == pytest.approx(6000.0 * math.exp(0.3))
+    assert found.monitor.principal_point_px == pytest.approx((953.0, 525.0))
+    same_focal = replace(found.monitor, focal_length_px=6000.0)
+    axis_px = np.ravel(same_focal.project(same_focal.cam_to_image[:, 2][None]))
+    # to second order: 5 px of 6000, squared
+    assert axis_px == pytest.approx([950.0, 530.0], abs=0.01)
+    turned = Rotation.from_rotvec(turn_rad) * Rotation.from_quat(q_poses[1], scalar_first=True)
+    assert to_matrix(found.q_poses[1]) == pytest.approx(turned.as_matrix())
+    assert found.q_poses[0].tolist() == q_poses[0].tolist()
+
+
+def dots_seen(
+    count: int, noise_px: tuple[float, float], frames: int = 1
+) -> tuple[Problem, MatchedDots]:
+    """Dots of a monitor that is seen pixel by pixel, each in some frames, with noise along x and y."""
+    rng = np.random.default_rng(8)
+    camera = Camera((1200, 800), 9000.0, (590.0, 410.0), np.eye(3))
+    upright = np.array([1.0, 0.0, 0.0, 0.0])
+    x_px, y_px = rng.uniform(0, 1200, count), rng.uniform(0, 800, count)
+    plan = DotPlan(x_px, y_px, np.ones((count, frames), dtype=bool))
+    frame = np.repeat(np.arange(frames), count)
+    seen = [
+        np.tile(place, frames) + rng.normal(0, noise, frames * count)
+        for place, noise in zip((x_px, y_px), noise_px, strict=True)
+    ]
+    centroids = Observed(frame, np.zeros_like(frame), *seen, np.ones(len(frame)))
+    problem = Problem(plan, Nominal(camera, upright, camera), upright[None], max(noise_px))
+    return problem, MatchedDots(centroids, np.tile(np.arange(count), frames))
+
+
+def test_a_dot_s_held_out_error_is_the_mean_of_its_frames_along_each_axis():
+    """Noise of 0.02 px along x and of 0.06 along y, in four frames: half of it each."""
+    problem, data = dots_seen(400, (0.02, 0.06), frames=4)
+    found = fit.held_out(problem, "pinhole", Model(PINHOLE), 0, data)
+    assert found.dot.tolist() == list(range(400))
+    rms_px = np.sqrt((found.off_arcsec**2).mean(axis=0)) / ARCSEC_PER_RAD * 9000.0
+    # of 400 dots, each known to 1 / sqrt(800) of its sigma
+    assert rms_px == pytest.approx([0.01, 0.03], rel=5 / math.sqrt(800))
+
+
+@pytest.mark.parametrize(("name", "numbers"), [("pinhole", 4 + 2), ("pinhole + k1", 5 + 2)])
+def test_a_model_is_tried_from_so_many_centroids_and_places_a_number_on(name, numbers):
+    """A model's own numbers and a shift's two, three of a centroid's to each; and of more places than
+    numbers.
+    """
+    enough = math.ceil(CENTROIDS_PER_NUMBER * numbers / 2)
+    for count, is_tried in ((enough, True), (enough - 1, False)):
+        tried = candidates(*dots_seen(count, (0.02, 0.02)), ())
+        assert (name in [model.name for model in tried]) == is_tried
+    # as many centroids of few dots
+    few, data = dots_seen(numbers, (0.02, 0.02), frames=9)
+    assert name not in [model.name for model in candidates(few, data, ())]

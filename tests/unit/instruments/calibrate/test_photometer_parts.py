@@ -35,6 +35,7 @@ from hilstar.instruments.calibrate.first_light.photometer import (
     _Values,
     field_for,
     lattice_profile,
+    monitor_area,
     peak_shares,
 )
 from hilstar.instruments.calibrate.plan import Patch
@@ -135,6 +136,26 @@ def test_a_field_has_all_pixels_of_the_rows_and_columns_that_its_light_falls_on(
 
 # Half of the smallest side, in whole cells: of the monitor, upright or not, or of the tracker; and
 # at most 200 px of the tracker.
+@pytest.mark.parametrize("size_px", [(40, 24), (31, 19)])
+def test_the_area_that_a_part_sees_is_that_of_the_screen_and_not_beyond_it(size_px):
+    """Of a tracker whose pixels are the monitor's, about the same middle: each sees one, by its own
+    light.
+    """
+    width, height = size_px
+    monitor = monitor_camera(size_px, 50.0, 100.0, UPRIGHT)
+    tracker = monitor_camera((width + 20, height + 20), 50.0, 100.0, UPRIGHT)
+    same = BenchGeometry(monitor, tracker)
+    even = np.random.default_rng(3).uniform(0.5, 1.0, (height, width)).astype(np.float32)
+    for rows, columns, own_rows, own_columns in (
+        (slice(0, height + 20), slice(0, width + 20), slice(0, height), slice(0, width)),
+        (slice(12, 17), slice(0, 14), slice(2, 7), slice(0, 4)),
+        (slice(height, height + 20), slice(15, 19), slice(height - 10, height), slice(5, 9)),
+    ):
+        part = even[own_rows, own_columns]
+        assert monitor_area(same, rows, columns) == pytest.approx(part.size)
+        assert monitor_area(same, rows, columns, even) == pytest.approx(float(part.sum()))
+
+
 @pytest.mark.parametrize(
     ("monitor_px", "tracker_px", "ratio", "side_px"),
     [

@@ -265,6 +265,12 @@ def test_codes_are_summed_over_the_tracker_s_window_on_the_monitor():
     # in one of two frames, of white's 7 electrons per second
     assert off_mag == pytest.approx(-2.5 * np.log10(7.0 * ring / 2 / 19**2))
     assert dark_mag == 0.0  # such a star is not shown
+    # at a corner of the screen the window is what of it is on the screen: 10 by 11 pixels
+    corner = np.zeros((60, 80), dtype=np.uint16)
+    corner[:10, :11] = 3
+    shown = (Levels(corner),)
+    (corner_mag,) = codes_mag(linear, shown, panel, np.array([[1.0, 0.0]]), reach)
+    assert corner_mag == pytest.approx(-2.5 * np.log10(7.0))
 
 
 @pytest.mark.parametrize("frames", [1, 4])

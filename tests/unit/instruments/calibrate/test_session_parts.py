@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from hilstar.display.identity import MonitorIdentity
+from hilstar.instruments.calibrate.first_light import session
 from hilstar.instruments.calibrate.first_light.context import (
     DarkSubtracted,
     FittedFigure,
@@ -94,6 +95,24 @@ def test_a_step_depends_on_its_tables_but_for_what_later_steps_set(tmp_path, num
             assert (after != before) == is_read
     by_another = state_sha256(STEPS[number], later, tables, tmp_path, "another")
     assert (by_another != before) == bool(STEPS[number].tables)
+
+
+def test_a_step_depends_on_what_its_files_hold_and_on_hilstar_s_version(tmp_path, monkeypatch):
+    (step,) = (step for step in STEPS if step.name == "photometry")
+    tables = {name: {} for name in BenchConfig.__struct_fields__}
+    tables["monitor"] = {"calibration": "light.toml"}
+
+    def state() -> str:
+        return state_sha256(step, frozenset(), tables, tmp_path, "a camera")
+
+    (tmp_path / "light.toml").write_text("one")
+    before = state()
+    (tmp_path / "light.toml").write_text("two")
+    assert state() != before
+    (tmp_path / "light.toml").write_text("one")
+    assert state() == before
+    monkeypatch.setattr(session, "__version__", "99")
+    assert state() != before
 
 
 def test_an_attempt_on_another_bench_or_with_another_number_of_patches_begins_anew(tmp_path):

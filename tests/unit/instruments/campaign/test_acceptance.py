@@ -53,12 +53,12 @@ VELOCITIES = "".join(
 SCENARIO = '[[fault]]\nname = "dark"\nkind = "blank"\nat_s = 0.5\nfor_s = 0.5\n'
 SETS = {
     "lost": "[cases.lost]\ncases = 60\nframes = 4\n",
-    "field": f"[cases.field]\ncases = 60\nframes = 3\n{FIELD}",
-    "slews": f"[cases.slews]\ncases = 40\nframes = 5\n{SLEWS}",
+    "field": f"[cases.field]\ncases = 60\nframes = 2\n{FIELD}",
+    "slews": f"[cases.slews]\ncases = 40\nframes = 3\n{SLEWS}",
     "aberration": f"[cases.aberration]\ncases = 30\n{VELOCITIES}",
-    "stars": "[cases.stars]\ncases = 40\nframes = 2\n",
+    "stars": "[cases.stars]\ncases = 40\n",
     "recovery": (
-        "[cases.recovery]\ncases = 20\nframes = 17\nstep_s = 0.1\n[[cases.recovery.vary]]\n"
+        "[cases.recovery]\ncases = 15\nframes = 17\nstep_s = 0.1\n[[cases.recovery.vary]]\n"
         'key = "scenario"\nvalues = ["dark.toml"]\n'
     ),
     "rate-limit": (
@@ -72,12 +72,12 @@ SETS = {
         '[[cases.sun.vary]]\nkey = "sky.bodies.sun"\nvalues = [true]\n'
     ),
     "dates": (
-        '[cases.dates]\ncases = 40\nframes = 2\n[[cases.dates.vary]]\nkey = "sky.epoch_utc"\n'
+        '[cases.dates]\ncases = 40\n[[cases.dates.vary]]\nkey = "sky.epoch_utc"\n'
         'values = ["1906-01-01T00:00:00", "1946-04-01T00:00:00", "2006-07-01T00:00:00",'
         ' "2046-10-01T00:00:00"]\n'
     ),
     "parallax": (
-        '[cases.parallax]\ncases = 60\nframes = 2\n[[cases.parallax.vary]]\nkey = "sky.epoch_utc"\n'
+        '[cases.parallax]\ncases = 60\n[[cases.parallax.vary]]\nkey = "sky.epoch_utc"\n'
         'values = ["2026-01-01T00:00:00", "2026-04-01T00:00:00", "2026-07-01T00:00:00",'
         ' "2026-10-01T00:00:00"]\n[[cases.parallax.vary]]\nkey = "spacecraft.orbit"\n'
         'values = ["geocentre"]\n'
@@ -232,6 +232,7 @@ FEW_CASES = SETS["lost"].replace("cases = 60", "cases = 8")  # none in 8 is fewe
     ("text", "told"),
     [
         (ONE.replace('of = "lost"', 'of = "los"'), "did you mean lost"),
+        (ONE + clause_text("availability", 0.9, "los", "minimum"), "[[clause]] number 2 (availability)"),
         (ONE.replace("minimum", "least"), "unknown key least"),
         (ONE.replace("[cases.lost]", '[cases."Lost case"]'), "small letters"),
         (ONE.replace("frames = 4", 'through = "tracker"'), "leave it out"),

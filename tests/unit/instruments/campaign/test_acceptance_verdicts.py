@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.instruments.assess.bounded_figures import clopper_pearson
 from hilstar.instruments.campaign.acceptance import PLAN_FILE, Acceptance
 from hilstar.instruments.campaign.acceptance_plan import read_acceptance_plan
@@ -19,12 +20,16 @@ from hilstar.instruments.campaign.acceptance_verdicts import ClauseVerdict, SetR
 from hilstar.instruments.campaign.case_table import Columns
 from hilstar.instruments.campaign.requirements import MET, NOT_MET, NOT_SHOWN
 from hilstar.instruments.campaign.run import Campaign
+from hilstar.instruments.campaign.star_motion import StarMotion
 from hilstar.instruments.campaign.store import Directory
 from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.cameras import bench_camera
 from tests.support.acceptance import write_bench
+from tests.support.certificates import a_certificate
 from tests.support.planted_answers import answers
 
 CASES, SILENT = 60, 20  # of which so many have no attitude
+BIAS_ARCSEC = 3.0
 LOST = "[cases.lost]\ncases = 60\n"
 
 
@@ -83,6 +88,77 @@ def test_a_clause_that_more_cases_would_decide_is_tested_and_one_without_its_col
     assert none.untested.startswith("recovery_s: the table has no such column")
 
 
+@pytest.mark.parametrize("through", ["tracker", "display"])
+def test_a_share_of_proper_motion_that_the_tracker_lacks_is_found_by_the_fields_own_turns(
+    tmp_path: Path, through: str
+) -> None:
+    """At dates over 40 years a tracker has followed three quarters of the motion of its stars,
+    which are those on the display where it looks at one.
+    """
+    rng = np.random.default_rng(6)
+    text = f'through = "{through}"\n' + LOST + clause("proper-motion", "maximum = 0.2")
+    acceptance = acceptance_of(tmp_path, text)
+    # half as wide as the field of 4.8 degrees
+    monitor = {"resolution_px": [44, 44], "pixel_pitch_um": 57.65}
+    acceptance.file = read_bench_file(write_bench(tmp_path, monitor=monitor))
+    cases = answers(rng)
+    jyears = 2016.0 + rng.uniform(-20.0, 20.0, cases.cases)
+    cases.numbers["vary.sky.epoch_jyear"] = jyears
+    display = None
+    if through == "display":
+        display = bench_camera(acceptance.file.config, acceptance.file.folder)
+    motion = StarMotion.of(acceptance.file, display)
+    q = cases.vectors("q{}", "wxyz")
+    turns = [motion.likely_turn_rad(attitude, acceptance.scale) for attitude in q]
+    missed_arcsec = 0.25 * ARCSEC_PER_RAD * np.array(turns) * (jyears - motion.jyear)[:, None]
+    for axis, arcsec in zip("xyz", missed_arcsec.T, strict=True):
+        cases.numbers[f"error_{axis}_arcsec"] = BIAS_ARCSEC + arcsec
+    (case_set,) = acceptance.sets
+    (found,) = acceptance.verdicts([SetResult(case_set, cases)])
+    assert found.word == NOT_MET and found.verdict is not None
+    assert found.verdict.value == pytest.approx(0.25, rel=1e-3)
+
+
+def test_a_certified_bench_s_own_errors_narrow_the_limits_of_attitude_and_of_time(
+    tmp_path: Path,
+) -> None:
+    text = LOST + clause("nea", "maximum = 30.0") + clause("time-bias", "maximum = 1.0")
+    acceptance = acceptance_of(tmp_path, text)
+    (case_set,) = acceptance.sets
+    rng = np.random.default_rng(4)
+    cases = answers(rng)
+    for axis in "xyz":
+        cases.numbers[f"scatter_{axis}_arcsec"] = rng.uniform(1.0, 3.0, cases.cases)
+    cases.numbers.update(solved=cases.numbers["frames"], wrong=np.zeros(cases.cases))
+    for certificate, guards in ((None, (0.0, 0.0)), (a_certificate(), (4.5, 0.00855))):
+        acceptance.certificate = certificate
+        verdicts = [each.verdict for each in acceptance.verdicts([SetResult(case_set, cases)])]
+        assert [each.guard for each in verdicts if each is not None] == pytest.approx(guards)
+
+
+def test_a_bootstrap_s_draws_are_by_the_plan_s_seed(tmp_path: Path) -> None:
+    text = LOST + clause("time-jitter", "maximum = 1.0")
+    cases = answers(np.random.default_rng(4), stamp_jitter=0.02)
+    ends = []
+    for seed in (5, 5, 6):
+        (each,) = judged(tmp_path, f"seed = {seed}\n{text}", cases)
+        assert each.verdict is not None
+        ends.append(each.verdict.high)
+    assert ends[0] == ends[1] != ends[2]
+
+
+def test_verdicts_stand_in_the_order_of_their_clauses_whatever_set_each_is_of(
+    tmp_path: Path,
+) -> None:
+    sets = LOST + "[cases.other]\ncases = 60\n"
+    clauses = [("availability", "other"), ("no-attitude", "lost"), ("no-attitude", "other")]
+    text = sets + "".join(clause(name, "maximum = 0.5", of) for name, of in clauses)
+    acceptance = acceptance_of(tmp_path, text.replace("maximum", "minimum", 1))
+    results = [SetResult(each, lost_cases()) for each in acceptance.sets]
+    found = [each.clause for each in acceptance.verdicts(results)]
+    assert [(each.quantity, each.of) for each in found] == clauses
+
+
 @pytest.mark.parametrize(
     ("clock", "stamp", "tells"),
     [
@@ -111,28 +187,37 @@ def test_stamps_of_an_own_clock_or_of_arrivals_tell_no_time_of_measurement(
     assert ("the stamps are of the tracker's own clock" in found.untested) == (not tells)
 
 
+@pytest.mark.parametrize("by_stars", [False, True])
 def test_failures_of_all_levels_of_a_sweep_count_together_and_each_level_has_its_folder(
-    tmp_path: Path,
+    tmp_path: Path, by_stars: bool
 ) -> None:
-    """A tracker that answers up to 2 deg/s; of each level's 16 cases one fails."""
+    """A tracker that answers up to 2 deg/s, with attitudes or with its stars to V = 5; of each
+    level's 16 cases one fails.
+    """
     acceptance = acceptance_of(
         tmp_path,
         "[cases.limit]\ncases = 16\n[cases.limit.sweep]\n"
         'key = "rate_deg_s.across"\nstart = 1.0\nstop = 5.0\nrounds = 2\n'
+        + "star_v_mag = 5.0\n" * by_stars
         + clause("edge", "minimum = 1.5", "limit"),
     )
     ran = []
 
     def run_cases(campaign: Campaign, directory: Directory, of: str) -> None:
         level = float(of.rpartition(" ")[2])
+        assert [each.values for each in campaign.plan.vary] == [[level]]
         ran.append(of)
+        is_seen = level <= 2.0
         table: dict[str, list[Any]] = {
             "case": list(range(16)),
             "status": ["failed", *["done"] * 15],
             "why": ["lens cap", *[""] * 15],
             "frames": [1] * 16,
-            "solved": [int(level <= 2.0)] * 16,
+            "solved": [int(is_seen and not by_stars)] * 16,
             "wrong": [0] * 16,
+            "star_frames": [1] * 16,
+            "star_v_mag": [[4.0, 6.0]] * 16,
+            "star_dx_px": [[0.0 if is_seen else np.nan, np.nan]] * 16,
         }
         pq.write_table(pa.table(table), directory.table)
 

@@ -15,8 +15,8 @@ from astropy.time import Time
 from scipy.spatial.transform import Rotation
 
 from hilstar.basics.errors import InputError
-from hilstar.basics.rotation import from_radec_roll_deg, propagate, to_matrix
-from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.basics.rotation import angle_between_rad, from_radec_roll_deg, propagate, to_matrix
+from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
 from hilstar.instruments.assess.places import Scale
 from hilstar.instruments.campaign.cases import CaseMaker, beside_q, value_kind
 from hilstar.instruments.campaign.job import Job, files_sha256
@@ -435,6 +435,47 @@ def test_a_fault_ends_after_the_case_s_own_begin_and_within_it(
     maker = maker_of(tmp_path, *vary)
     case = maker.case(0, np.full(maker.attitude_dimensions + 2, 0.5))
     assert maker.fault_end_s(case, length_s) == end_s
+
+
+@pytest.mark.parametrize("time_s", [0.0, 40.1])
+def test_a_case_that_begins_later_swings_as_one_that_begins_at_once(
+    tmp_path: Path, time_s: float
+) -> None:
+    """An exposure of 0.1 s from 0.2 s after its begin on, in pieces of a swing of 7 Hz."""
+    vary = (
+        {"key": "jitter_arcsec.x", "values": [100.0]},
+        {"key": "jitter_hz", "values": [7.0]},
+        {"key": "time_s", "values": [time_s]},
+    )
+    maker = maker_of(tmp_path, *vary, frames=2, step_s=0.25)
+    case = maker.case(0, np.full(maker.attitude_dimensions + 3, 0.5))
+    view = maker.view(case, 1, 0.1)
+    with Simulator(maker.file) as simulator:
+        faulty = maker.faults(case, view, simulator)
+    assert faulty is not None and len(faulty.pieces) > 8
+    for shown in (piece.view for piece in faulty.pieces):
+        assert shown.t_ns is not None
+        after_s = shown.t_ns / NS_PER_S - time_s
+        assert 0.2 < after_s < 0.3
+        wanted = case.motion.at(after_s).q_icrs_to_cam
+        assert angle_between_rad(shown.q_icrs_to_cam, wanted) < 1e-9
+
+
+def test_a_scenario_along_a_log_counts_from_the_log_s_begin(tmp_path: Path) -> None:
+    """A log of 9 s of a clock that is far from 0, and a fault from its 1st to its 3rd second."""
+    (tmp_path / "dark.toml").write_text(SCENARIO)
+    rows = "".join(f"{t_s},1,0,0,0\n" for t_s in (5000, 5009))
+    (tmp_path / "log.csv").write_text("t_s,qw,qx,qy,qz\n" + rows)
+    log = {"kind": "log", "log": "log.csv"}
+    maker = maker_of(tmp_path, {"key": "scenario", "values": ["dark.toml"]}, attitudes=log)
+    active = []
+    with Simulator(maker.file) as simulator:
+        for share in (0.5 / 9, 2 / 9, 3.5 / 9):
+            case = maker.case(0, np.array([share, 0.5]))
+            faulty = maker.faults(case, maker.view(case, 0, 0.1), simulator)
+            assert faulty is not None
+            active.append([len(piece.now) for piece in faulty.pieces])
+    assert active == [[0], [1], [0]]
 
 
 @pytest.mark.parametrize("values", [[5.0, 20.0], [20.0, 5.0]])

@@ -82,6 +82,7 @@ def looking(*vary: dict[str, Any], **attitudes: Any) -> str:
     return plan_text(*vary, attitudes=attitudes)
 
 
+CLAUSE = ("", "[[require]]")
 PLANS = [
     (looking(kind="field"), "radec_deg"),
     (looking(kind="log"), "log"),
@@ -99,6 +100,8 @@ PLANS = [
     (required('quantity = "bias"', "maximum = 3", "share = 0.9"), "leave share out"),
     (required('quantity = "rate-bias"', "maximum = 1.0"), "write columns = "),
     (required('quantity = "edge"', "maximum = 1.0"), "is of a sweep"),
+    (noise("maximum = 3", *CLAUSE, 'quantity = "edge"', "maximum = 1"), "number 2 .edge.: is of"),
+    (noise("maximum = 3", *CLAUSE, 'quantity = "noise"'), "number 2 .noise.: "),
 ]
 
 

@@ -116,6 +116,14 @@ def test_both_ways_are_compared_by_their_ratio_and_where_they_differ(written) ->
     assert list(page._both_ways(a_certificate(figures=[a_figure("flux", 0, 1, "mag")]))) == []
 
 
+def test_of_many_figures_that_differ_the_first_are_listed_and_all_are_counted(monkeypatch) -> None:
+    monkeypatch.setattr(page, "MAX_APART", 2)
+    apart = next(each for each in a_certificate().figures if each.star == 11 and each.by_trials)
+    told = list(page._both_ways(a_certificate(figures=[apart] * 3)))
+    assert told[1].startswith("<p>3 figures differ by more than 5 %")
+    assert told[2].count(f">{BY_CLOCK}<") == 2
+
+
 def test_bars_are_each_input_s_rms_over_all_figures_of_a_kind(written) -> None:
     """0.004 and 0.012 of three stars, one of which has none of it."""
     light, place = written[1]

@@ -61,10 +61,10 @@ from tests.support.planted_run import write_run
 from tests.support.planted_tracker import Planted, Sizes, scan
 from tests.support.planted_tracker import plant as plant_tracker
 
-BENCHES = 24
+BENCHES = 16
 FAR = 3 * math.sqrt(0.05 * 0.95 / BENCHES)  # the figures of one bench's third go nearly together
 UNCHANGED = 20
-FEW = 8
+FEW = 6
 # of figures that go together in each of FEW benches
 MIN_HELD = 0.95 - 3 * math.sqrt(0.05 * 0.95 / FEW)
 LONGEST = 2.5  # stated over true errors, by the median of FEW benches

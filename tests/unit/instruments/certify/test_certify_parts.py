@@ -600,6 +600,7 @@ def test_a_certificate_has_the_hashes_of_the_bench_s_files_and_of_those_that_the
         "light/r.csv": "code,w\n0,0\n",
         "light/u.csv": "1,1\n",
         "qe.csv": "wavelength_nm,qe\n",
+        "lens.toml": "[distortion]\n",
     }
     for name, text in files.items():
         (tmp_path / name).write_text(text)
@@ -610,6 +611,7 @@ def test_a_certificate_has_the_hashes_of_the_bench_s_files_and_of_those_that_the
         white=1e6,
     )
     text = text.replace('"ccd47-20"', '"qe.csv"')
+    text = text.replace("[tracker]\n", '[tracker]\ndistortion = "lens.toml"\n')
     bench = bench_file_of(tmp_path / "bench.toml", text)
     expected = {name: sha256(text.encode()).hexdigest() for name, text in files.items()}
     expected["bench.toml"] = sha256(text.encode()).hexdigest()

@@ -306,13 +306,19 @@ def test_a_full_scale_that_is_stated_moves_all_stars_alike(tmp_path, freedom, di
 def test_an_alignment_s_covariance_turns_the_sky_about_its_own_axes(tmp_path):
     """In the middle of the field a turn about x moves a star along y, and one about y along x."""
     error = "alignment_covariance_arcsec2 = [[4, 0, 0], [0, 9, 0], [0, 0, 100]]\n"
-    place = of_geometry(tmp_path, error)["alignment"].place
-    covariance = np.einsum("ksi,ksj->sij", place, place)
+    effect = of_geometry(tmp_path, error)["alignment"]
+    covariance = np.einsum("ksi,ksj->sij", effect.place, effect.place)
     assert covariance[0] == pytest.approx(np.diag([9.0, 4.0]))
+    assert effect.input.standard == pytest.approx(math.sqrt((4 + 9 + 100) / 3))
     # a star beside the middle also goes round it, by as much as it is beside
     u, v = EDGE_TANGENT * np.array(TANGENTS[1])
     along = 9 * (1 + u**2) ** 2 + 4 * (u * v) ** 2 + 100 * v**2
     assert covariance[1, 0, 0] == pytest.approx(along)
+    # turns that go together: a star that goes up for one goes to the other side for the other
+    mixed = "alignment_covariance_arcsec2 = [[4, 2, 0], [2, 9, 1], [0, 1, 100]]\n"
+    place = of_geometry(tmp_path, mixed)["alignment"].place
+    covariance = np.einsum("ksi,ksj->sij", place, place)
+    assert covariance[0] == pytest.approx(np.array([[9.0, -2.0], [-2.0, 4.0]]))
 
 
 def test_levels_of_a_calibration_move_the_light_that_stars_have_of_them(tmp_path):

@@ -282,6 +282,19 @@ def test_each_piece_of_an_exposure_has_its_own_middle_on_the_clock_of_its_view(t
     assert [piece.view.exposure_s for piece in pieces] == pytest.approx([0.02, 0.02, 0.06])
 
 
+def test_an_exposure_of_several_views_has_them_one_after_the_other_about_its_middle(tmp_path):
+    """0.06 s and 0.04 s about the 2nd second: from 1.95 to 2.01 and to 2.05 s."""
+    text = '[[fault]]\nkind = "blank"\nname = "cover"\nat_s = 2.02\nfor_s = 0.01\n'
+    scenario = parse_scenario(tmp_path / "faults.toml", text)
+    views = [View.exposure(np.array(ORION_Q), STILL, length_s) for length_s in (0.06, 0.04)]
+    file = bench_file_of(tmp_path / "bench.toml", bench_text())
+    with Simulator(file) as simulator:
+        pieces = faulty_exposure(simulator, views, scenario, 2 * NS_PER_S).pieces
+    assert [len(piece.now) for piece in pieces] == [0, 0, 1, 0]
+    lengths_s = [piece.view.exposure_s for piece in pieces]
+    assert lengths_s == pytest.approx([0.06, 0.01, 0.01, 0.02])
+
+
 def test_faults_of_a_log_count_from_its_first_sample(tmp_path):
     """Of a clock that is far from 0: the display stands still from the first second on, in which it
     has the log's own attitude.

@@ -250,6 +250,7 @@ def rolled(samples: int, axis: int):
 
 SPOILT = [
     (put("POINTS", "x_px", 0, np.nan), "x_px, y_px or focus_um is not finite"),
+    (put("POINTS", "focus_um", 0, np.inf), "x_px, y_px or focus_um is not finite"),
     (put("POINTS", "weights", (0, 0), np.inf), "a place, a focus, a weight or a sample is not fin"),
     (put("POINTS", "weights", (0, 0), 0.5), "the PSF at (0, 0) px, 450 nm sums to "),
     (put("POINTS", "weights", (0, 0), 1.5), "the PSF at (0, 0) px, 450 nm sums to "),
@@ -291,6 +292,12 @@ def test_points_with_and_without_a_wavelength_are_no_glass():
     at[1, 2] = np.nan
     line = refusal(glass_of, replace(plain, at=at))
     assert line.startswith("some points have a wavelength and others none")
+
+
+def test_a_point_with_two_images_of_a_wavelength_is_no_glass():
+    plain = stack(1, (450.0, 650.0, 650.0))
+    line = refusal(glass_of, plain)
+    assert "px has 2 images of 650 nm at focus 0 um; give each point one image of" in line
 
 
 def test_more_images_than_a_glass_may_have_are_refused(monkeypatch):

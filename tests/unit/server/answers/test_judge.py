@@ -215,6 +215,27 @@ def test_a_delay_that_no_motion_shows_goes_back_to_the_one_that_is_assumed():
     assert judge.times.sigma_s == pytest.approx(0.1)
 
 
+def test_errors_that_were_kept_go_back_with_the_delay_to_the_one_that_is_assumed():
+    """Five answers fit a delay of 0.3 s; then come thirteen that are 2 degrees off."""
+    rules = AnswerRules(EXPOSURE_S, stamp="arrival")
+    judge = AnswerJudge(rules, lit_in_turn(LitFrames(PERIOD_NS), STEADY_RAD_S))
+    judge.times.shift(DelayFit(0.3 - judge.times.guess_s, 0.01))
+    off = from_rotation_vector(np.radians([2.0, 0.0, 0.0]))
+    verdicts, assumed = [], []
+    for k in range(18):
+        host_s = 1.05 + k / 16
+        q = propagate(START, STEADY_RAD_S, host_s - 0.3)
+        host_ns = round(host_s * NS_PER_S)
+        answer = Answer(host_ns, b"", None, q if k < 5 else multiply(off, q))
+        verdicts.append(judge.judge(answer).verdict)
+        shown = propagate(START, STEADY_RAD_S, host_s - judge.times.guess_s)
+        assumed.append(residual_arcsec(q, shown))
+    assert verdicts == ["right"] * 5 + ["wrong"] * 13
+    assert judge.times.delay_s == judge.times.guess_s
+    mean = judge.figures(host_ns, {}).mean_arcsec
+    assert mean == pytest.approx(np.mean(assumed[:5], axis=0), abs=TURN_ARCSEC)
+
+
 BIAS_ARCSEC, NOISE_ARCSEC = np.array([12.0, -7.0, 30.0]), np.array([3.0, 3.0, 20.0])
 LATENCY_S, JITTER_S, DRIFT, EPOCH_NS = 0.18, 0.004, 40e-6, 123 * NS_PER_S
 

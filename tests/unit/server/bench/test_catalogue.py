@@ -249,6 +249,14 @@ def test_instrument_magnitudes_are_those_of_own_quadrature(tmp_path, tracker):
     )
 
 
+def test_a_neighbour_is_as_much_fainter_at_most_as_its_description_says(bright):
+    said = re.search(r"less than ([\d.]+) mag fainter", bright.columns["neighbour"].description)
+    neighbour_mag = bright.columns["neighbour_v_mag"].values
+    fainter_mag = neighbour_mag - bright.columns["v_mag"].values
+    # of 177 stars some have one near the limit
+    assert float(said[1]) - 0.1 < fainter_mag.max() < float(said[1])
+
+
 @pytest.mark.parametrize("system", ["vega", "ab"])
 def test_a_magnitude_s_zero_point_is_the_one_that_its_description_and_the_file_state(
     bright, tmp_path, system

@@ -233,6 +233,17 @@ def test_all_channels_together_have_the_sum_of_their_curves_though_one_ends_abov
 
 
 @pytest.mark.gpu
+def test_the_planes_of_a_cube_are_numbered_from_1_in_the_order_of_red_green_and_blue(
+    curves, tmp_path
+):
+    with bench_with(curves, "rgb", {"sky": {"faintest_v_mag": 1.0}}) as bench:
+        write_frame_fits(tmp_path / "cube.fits", bench, bench.frame(ORION_Q))
+    header = fits.getheader(tmp_path / "cube.fits")
+    numbered = {key: header[key] for key in header if key.startswith("CHANNEL")}
+    assert numbered == {f"CHANNEL{k}": f"quantum_efficiency_{c}" for k, c in enumerate("rgb", 1)}
+
+
+@pytest.mark.gpu
 def test_the_fits_of_three_channels_is_a_cube_with_the_skys_own_axes(curves, tmp_path):
     with bench_with(curves, "rgb") as bench:
         frame = bench.frame(ORION_Q)

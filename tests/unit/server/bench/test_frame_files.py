@@ -5,16 +5,22 @@ from __future__ import annotations
 import numpy as np
 import png
 import pytest
+from astropy.io import fits
 from PIL import Image
 from scipy.ndimage import gaussian_filter, maximum_filter
 
+from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.server.bench.bench_file import bench_file_of
+from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.frame_files import (
     PREVIEW_BLUR_PX,
     PREVIEW_POWER,
     PREVIEW_RADIUS_PX,
     png_of,
+    write_frame_fits,
     write_preview_png,
 )
+from tests.support.benches import bench_text
 
 
 def preview_by_filters(codes):
@@ -44,6 +50,30 @@ def test_a_preview_has_a_disc_for_each_lit_pixel_to_the_edges(tmp_path, lit):
     assert np.array_equal(
         np.asarray(Image.open(tmp_path / "preview.png")), preview_by_filters(codes)
     )
+
+
+def test_a_frame_s_header_says_where_it_looks_and_what_it_is_of(tmp_path):
+    text = bench_text({"sky": {"faintest_v_mag": 3.0, "epoch_jyear": 2027.5}})
+    file = bench_file_of(tmp_path / "bench.toml", text)
+    with open_bench(file) as bench:
+        frame = bench.frame(from_radec_roll_deg(283.021, 35.349, 30.0))
+        write_frame_fits(tmp_path / "frame.fits", bench, frame)
+    header = fits.getheader(tmp_path / "frame.fits")
+    assert [header[name] for name in ("RA_PNT", "DEC_PNT", "ROLL_PNT")] == pytest.approx(
+        [283.021, 35.349, 30.0], abs=1e-9
+    )
+    # the convention's check value, of seven digits
+    assert [header[name] for name in ("QW", "QX", "QY", "QZ")] == pytest.approx(
+        [0.3257559, -0.0677680, -0.4540152, 0.8265354], abs=6e-8
+    )
+    assert header["NSTARS"] == len(frame.truth) > 0
+    assert header["WHITE"] == bench.flux_at_white_e_per_s
+    assert (header["EPOCHJYR"], header["BENCHSHA"]) == (2027.5, file.sha256)
+    assert (header["CALNAME"], header["CALSHA"]) == (
+        bench.calibration.name,
+        bench.calibration.sha256,
+    )
+    assert header["CALSHA"] != file.sha256
 
 
 @pytest.mark.parametrize("radius_px", [8, 20, 45])

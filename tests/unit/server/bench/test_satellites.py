@@ -10,14 +10,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
 from hilstar.instruments.campaign.display_tracker import DisplayTracker
 from hilstar.instruments.simulate.simulator import Simulator
+from hilstar.optics.layers.view import View
 from hilstar.optics.trails import DiscTrail, hidden
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.build import load
 from hilstar.server.bench.frame import Bench
+from hilstar.server.bench.star_light import bench_moving
 from hilstar.sky.bodies.disc import Disc
 from hilstar.sky.bodies.passes import Cone
 from tests.support.benches import bench_text
@@ -94,6 +97,20 @@ def test_a_frame_its_truth_and_a_run_s_frame_have_the_same_satellite(tle_bench):
         )
 
 
+def test_a_satellite_has_the_sun_s_light_whatever_else_the_sky_shows(tle_bench):
+    file = read_bench_file(tle_bench)
+    rates = []
+    for moon in (False, True):
+        bodies = structs.replace(file.config.sky.bodies, moon=moon)
+        sky = structs.replace(file.config.sky, bodies=bodies)
+        moving = bench_moving(structs.replace(file.config, sky=sky), file.folder)
+        seen = moving.passing(Cone(NORTH, np.pi, 0.0), AT_S * S_NS)
+        now = np.zeros(len(seen))
+        rates.append(seen.rates_e_per_s(np.arange(len(seen)), now, now))
+    assert np.nanmax(rates[0]) > 0
+    np.testing.assert_allclose(*rates, rtol=1e-9)
+
+
 @pytest.mark.parametrize(("share", "is_drawn"), [(0.99, True), (1.01, False)])
 def test_a_run_s_frame_has_no_satellite_fainter_than_the_monitor_shows(tle_bench, share, is_drawn):
     with load(tle_bench) as bench:
@@ -103,6 +120,25 @@ def test_a_run_s_frame_has_no_satellite_fainter_than_the_monitor_shows(tle_bench
         of_monitor = replace(bench, faintest_shown_e_per_s=share * rate)
         drawn = np.unique(of_monitor.light(view).star)
         assert (name in bench.shown_stars.names(drawn)) is is_drawn
+
+
+def test_each_frame_of_an_exposure_has_the_satellites_of_its_own_time(tle_bench, monkeypatch):
+    """Six frames of 60 Hz in a tenth of a second, about its middle."""
+    drawn = []
+    draw = Bench.draw
+
+    def seen(bench, q, frame, t_ns):
+        drawn.append(t_ns - AT_S * S_NS)
+        return draw(bench, q, frame, t_ns=t_ns)
+
+    monkeypatch.setattr(Bench, "draw", seen)
+    text = tle_bench.read_text().replace("[1024, 1024]", "[64, 64]")
+    tle_bench.write_text(text.replace("[sky]", "[sky]\nfaintest_v_mag = 3.0"))
+    display = DisplayTracker(read_bench_file(tle_bench))
+    q = from_radec_roll_deg(84.0, 0.0, 0.0)
+    display.expose(View.exposure(q, np.zeros(3), 0.1, AT_S * S_NS), None)
+    display.close()
+    assert np.array(drawn) / S_NS * 120 == pytest.approx([-5, -3, -1, 1, 3, 5], abs=1e-6)
 
 
 def fast_moment(bench: Bench) -> int:

@@ -31,6 +31,18 @@ def test_each_star_has_its_own_variability_and_companion():
     assert (algol["variable"], algol["range_mag"], algol["double"]) == ("P", 0.14, "O")
     assert np.isnan(algol["period_d"])
 
+    # rows in any order, that of the catalogue's first star among them, are those of their stars
+    order = np.roll(every[::-1], 3)
+    again = truth_table(stars, order, ones, ones)
+    for name in truth.dtype.names:
+        np.testing.assert_array_equal(again[name], truth[name][order], name)
+    first = truth[np.flatnonzero(stars.row == 0)[0]]
+    alone = load_catalog().brighter_than(3.5)
+    assert (first["variable"], first["double"]) == (
+        alone.variable[0].decode(),
+        alone.multiple[0].decode(),
+    )
+
     unlisted = replace(stars, row=np.where(stars.hip == 65378, -1, stars.row))
     row = truth_table(unlisted, np.flatnonzero(stars.hip == 65378), ones[:1], ones[:1])[0]
     assert (row["double"], row["variable"]) == ("", "")

@@ -82,6 +82,29 @@ def _polynomial(header, name, at):
     )
 
 
+def test_a_bent_image_s_keywords_lead_to_the_lens_s_own_places_either_way():
+    """By Astropy's iteration and by the header's inverse, as far off as the header says."""
+    lens = Lens(radial=(-0.4, 0.1, 0.0), tangential=(0.02, -0.03))
+    straight = monitor_camera(SIZE, 57.65, 350.0, np.array([1.0, 0.0, 0.0, 0.0]))
+    bent = bounded(replace(straight, lens=lens), 6.0)
+    q = from_radec_roll_deg(*ATTITUDES[2])
+    keywords = world_coordinates(bent, q)
+    assert keywords["CTYPE2"] == "DEC--TAN-SIP"
+    ra_deg, dec_deg, _ = sky_of(bent, q, *whole_screen())
+    wcs = WCS({"NAXIS": 2} | keywords)
+    at_x, at_y = whole_screen()
+    flat = np.column_stack(wcs.wcs_world2pix(ra_deg, dec_deg, 0)) - (wcs.wcs.crpix - 1)
+    x_px = flat[:, 0] + _polynomial(keywords, "AP", flat) + wcs.wcs.crpix[0] - 1
+    y_px = flat[:, 1] + _polynomial(keywords, "BP", flat) + wcs.wcs.crpix[1] - 1
+    inverse_px = np.hypot(x_px - at_x, y_px - at_y).max()
+    iterated = np.array(wcs.all_world2pix(ra_deg, dec_deg, 0)) - whole_screen()
+    iterated_px = np.hypot(*iterated).max()
+    largest_px = max(inverse_px, iterated_px)
+    assert largest_px < BETWEEN_PLACES * keywords["LENSERR"] + 1e-4
+    # the lens itself is a polynomial of directions
+    assert inverse_px < 1e-6 and largest_px > keywords["LENSERR"] / BETWEEN_PLACES
+
+
 def test_a_lens_that_no_sip_fits_leaves_tan_and_says_how_far_it_is_off(rng):
     camera = monitor_camera(SIZE, 57.65, 350.0, np.array([1.0, 0.0, 0.0, 0.0]))
     x, y = np.zeros((16, 16)), np.zeros((16, 16))

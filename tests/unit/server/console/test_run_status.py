@@ -124,8 +124,9 @@ def test_an_attitude_is_said_with_its_turn_and_its_age(run):
 
 
 def test_a_wrong_sky_a_ledger_and_a_forced_screen_are_said_first_and_last(
-    loop, small_bench, tmp_path
+    loop, small_bench, tmp_path, monkeypatch
 ):
+    monkeypatch.setattr(Ledger, "size_bytes", 12_360_000)  # 11.8 MiB
     run = FollowedRun(loop, forced="another monitor")
     run.follow()
     run.show(7)
@@ -140,7 +141,7 @@ def test_a_wrong_sky_a_ledger_and_a_forced_screen_are_said_first_and_last(
         ]  # fmt: skip
         lines = run.lines()
         assert lines["sky"] == StatusLine("sky", "WRONG: twice as fast", False)
-        text = f"{ledger.path}, {ledger.size_bytes / 1e6:.1f} MB"
+        text = f"{ledger.path}, 12.4 MB"
         assert lines["ledger"] == StatusLine("ledger", text)
         assert lines["forced"] == StatusLine("forced", "another monitor", False)
         ledger.failure = "no space"

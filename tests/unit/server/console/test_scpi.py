@@ -145,6 +145,8 @@ def test_numbers_are_read_as_ieee_488_writes_them():
     assert [scpi.number(each, "DEG/S") for each in unit.parameters] == [0.15, 255.0, -0.5]
     (unit,) = units('SKY:FAUL "say ""so""", \'ON\'')
     assert [each.text for each in unit.parameters] == ['say "so"', "ON"]
+    (unit,) = units('SKY:FAUL "it\'s; on, now", \'a "b"\'')
+    assert [each.text for each in unit.parameters] == ["it's; on, now", 'a "b"']
     assert [scpi.boolean(units(f"SKY:BLAN {word}")[0].parameters[0]) for word in ("on", "OFF", "0", "0.4", "0.6", "7")] == [
         True, False, False, False, True, True,
     ]  # fmt: skip

@@ -329,8 +329,11 @@ def test_every_feature_of_the_description_is_a_register_that_can_be_read():
     root = ElementTree.fromstring(_description(client))
     space = "{http://www.genicam.org/GenApi/Version_1_1}"
     names = {node.get("Name") for node in root}
-    for node in root.iter(f"{space}pFeature"):
-        assert node.text in names
+    listed = {node.text for node in root.iter(f"{space}pFeature")}
+    assert listed <= names
+    # and each is in a category, without which no client's tree shows it
+    for kind in ("Integer", "Float", "Enumeration", "Command", "StringReg"):
+        assert {node.get("Name") for node in root.iter(f"{space}{kind}")} <= listed
     for node in root.iter(f"{space}pValue"):
         assert node.text in names
     for node in root.iter(f"{space}Address"):
@@ -371,6 +374,9 @@ def test_memory_beyond_the_description_is_no_memory():
         at = DESCRIPTION_AT + -(-size // 4) * 4 - 4
         status, _ = client.ask(READ_MEMORY, struct.pack(">IHH", at, 0, count))
         assert (status == GvcpStatus.SUCCESS) is is_there
+    # as many bytes as a datagram of 576 holds beside its heads
+    status, body = client.ask(READ_MEMORY, struct.pack(">IHH", DESCRIPTION_AT, 0, 536))
+    assert status == GvcpStatus.SUCCESS and len(body) == 4 + 536
     # its last word is filled up with zeros
     camera = CameraSettings(64, 48, 12, exposure_s=0.05, rate_hz=10.0)
     registers = Registers(IDENTITY, camera, b"<xml>")

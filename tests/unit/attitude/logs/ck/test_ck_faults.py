@@ -4,6 +4,7 @@ refused in one line.
 
 from __future__ import annotations
 
+import os
 import struct
 import sys
 from pathlib import Path
@@ -241,6 +242,18 @@ def test_a_kernel_that_is_none_is_refused(tmp_path, raw, monkeypatch, text, word
     name = "all.tm" if "KPL/MK" in text else "x.tls"
     (tmp_path / name).write_text(text)
     assert words_said in ck_refusal(tmp_path / "whole.bc", kernels=[name])
+
+
+@pytest.mark.parametrize(("begin", "said"), [("KPL/LSK\n", "50 MB"), ("DAF/SPK\n", "4 GB")])
+def test_a_kernel_of_one_byte_over_its_limit_is_refused_before_spice_reads_it(
+    tmp_path, raw, begin, said
+):
+    kernel = tmp_path / "x.tls"
+    kernel.write_text(begin)
+    limit_bytes = {"50 MB": 50 * 10**6, "4 GB": 4 * 10**9}[said]
+    os.truncate(kernel, limit_bytes + 1)
+    line = ck_refusal(tmp_path / "whole.bc", kernels=[kernel.name])
+    assert line.startswith(f"{kernel}: ") and f"and at most {said} are read" in line
 
 
 def test_a_structure_that_is_not_there_is_refused_with_those_that_are(tmp_path, raw):

@@ -16,6 +16,7 @@ from tests.support.sources.ros_bags import START_NS
 from tests.support.sources.ros_poses import (
     MAKE,
     fixed_transform,
+    moved_transform,
     pose,
     poses,
     recorded_in_turn,
@@ -156,6 +157,11 @@ TREES = [
         [fixed_transform("base", "cam", (0.5, 0, 0, 0)), *tree([("icrs", "base", rotations(3))])],
         {"body": "cam"},
         "the transform base -> cam has a quaternion whose norm is off by 0.5",
+    ),
+    (
+        [*tree([("icrs", "base", rotations(3))]), moved_transform("icrs", "base", (2, 0, 0, 0))],
+        {"body": "base"},
+        "transform 4 of icrs -> base: .*norm is 2;",
     ),
     (
         CHAIN,

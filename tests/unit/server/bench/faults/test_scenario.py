@@ -105,6 +105,10 @@ def test_a_wrong_fault_is_refused_with_its_key_and_what_to_write(change, said):
             "17 gradients and maps",
         ),
         (
+            "\n".join(f'[[fault]]\nkind = "blank"\nname = "{k}"' for k in range(257)),
+            "has 257 faults; write at most 256",
+        ),
+        (
             (
                 '[[fault]]\nkind = "cosmic-rays"\nname = "b"\nnumber = 5000\nelectrons ='
                 " 1\nlength_px = 500"

@@ -112,6 +112,22 @@ def test_the_console_starts_and_stops_a_fault_of_the_scenario_by_name():
     assert heard[-1].number == 2  # the second start of the run
 
 
+def test_a_fault_is_stopped_while_it_waits_and_begun_anew_with_the_frame_that_ends_it():
+    schedule, heard = schedule_of(false_star("ghost"), blank("cover"))
+    schedule.at(0)
+    schedule.start("ghost", "console")
+    schedule.ask(blank("later", at_s=0.02), "stream")
+    for name in ("ghost", "later"):
+        schedule.stop(name, "console")
+    assert faults_by_frame(schedule, 3, 1) == [[], [], []] and heard == []
+    schedule.start("ghost", "console")
+    schedule.at(4 * FRAME_NS)
+    schedule.stop("ghost", "console")
+    schedule.start("ghost", "stream")
+    assert faults_by_frame(schedule, 1, 5) == [[("ghost", 1.0)]]
+    assert [(c.what, c.number) for c in heard] == [("start", 1), ("end", 1), ("start", 2)]
+
+
 def test_what_cannot_be_started_or_stopped_is_refused_in_a_line():
     schedule, _ = schedule_of(blank("cover"))
     with pytest.raises(

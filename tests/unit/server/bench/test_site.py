@@ -1,0 +1,38 @@
+"""The air of a site: whose extinction is taken, and what is none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hilstar.server.bench.config.sky import SiteSettings
+from hilstar.server.bench.site import site_extinction
+from tests.support.refusals import refusal
+
+NM = np.array([450.0, 550.0])
+
+
+def site(extinction: float | str) -> SiteSettings:
+    return SiteSettings(latitude_deg=-24.6, longitude_deg=-70.4, extinction=extinction)
+
+
+def test_an_extinction_is_a_number_a_place_s_or_a_file_s(tmp_path):
+    (tmp_path / "own.csv").write_text("wavelength_nm,value\n400,10\n600,0.2\n")
+    assert site_extinction(site(0.25), tmp_path)(NM) == pytest.approx([0.25, 0.25])
+    assert site_extinction(site("own.csv"), tmp_path)(NM) == pytest.approx([7.55, 2.65])
+    blue, green = site_extinction(site("paranal"), tmp_path)(NM)
+    assert 0.05 < green < blue < 0.3  # Patat et al. 2011: 0.19 and 0.12
+
+
+@pytest.mark.parametrize(
+    ("extinction", "words"),
+    [
+        (-0.01, "[site] extinction = -0.01: write magnitudes an air mass, 0 to 10"),
+        (10.5, "[site] extinction = 10.5: write magnitudes an air mass, 0 to 10"),
+        ("paranall", "did you mean paranal"),
+        ("thick.csv", "thick.csv"),
+    ],
+)
+def test_what_is_no_extinction_is_refused(tmp_path, extinction, words):
+    (tmp_path / "thick.csv").write_text("wavelength_nm,value\n400,10.5\n600,0.2\n")
+    assert words in refusal(site_extinction, site(extinction), tmp_path)

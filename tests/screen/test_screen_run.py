@@ -176,11 +176,6 @@ with load(resource_path("configs", "demo.toml")) as bench:
         loop.draw(number, 0, turning)
     print(gc.collect())
 """
-    result = subprocess.run(
-        [sys.executable, "-c", program],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        check=True,
-    )
+    result = run_started([sys.executable, "-c", program])
+    assert result.returncode == 0, result.stderr
     assert int(result.stdout) == 0

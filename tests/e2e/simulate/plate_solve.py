@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 
-np.math = math  # type: ignore[attr-defined] # a name of NumPy 1 that the solver takes a factorial by
+np.math = math  # a name of NumPy 1 that the solver takes a factorial by
 
 import tetra3  # noqa: E402
 

@@ -105,6 +105,18 @@ def test_a_table_is_the_same_bytes_whatever_the_order_and_the_pauses(tmp_path: P
     assert not (tmp_path / "2").exists()
 
 
+def test_a_row_in_another_block_s_file_is_dropped(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "j", 16)
+    journal.append([row(3), row(9)])
+    journal.close()
+    first, second = (tmp_path / "j" / f"00000{block}.jsonl" for block in (0, 1))
+    first.write_bytes(first.read_bytes() + second.read_bytes())
+    second.unlink()
+    again = Journal(tmp_path / "j", 16)
+    assert again.done == 1 and 9 in again.missing(1)
+    again.close()
+
+
 def test_a_full_block_that_lost_rows_is_refused(tmp_path: Path) -> None:
     journal = Journal(tmp_path / "j", 3)
     journal.append([row(case) for case in range(3)])

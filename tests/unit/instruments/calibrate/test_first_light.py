@@ -46,8 +46,8 @@ from hilstar.instruments.calibrate.first_light.image_sources import (
 from hilstar.instruments.calibrate.first_light.session import (
     FirstLightSession,
     SessionPlan,
-    SessionStep,
 )
+from hilstar.instruments.calibrate.first_light.steps import SessionStep
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.optics.scan import Orientation
 from hilstar.server.bench.bench_file import read_bench_file

@@ -197,6 +197,13 @@ def test_an_image_without_a_time_is_undated_and_said(cards, words):
     assert any(words in note for note in found.notes), found.notes
 
 
+@pytest.mark.parametrize("key", ["DATE-AVG", "DATE-END"])
+def test_a_time_of_day_of_its_own_is_that_of_the_exposure_s_start_alone(key):
+    found = read_image({key: "2024-03-01", "TIME-OBS": "20:00:00", "EXPTIME": 10.0})
+    assert found.t_ns is None
+    assert "tells no time of day" in found.notes[-1]
+
+
 def test_an_undated_image_is_said_beside_what_else_is():
     found = read_image({"DATE-OBS": "2024-03-01", "EXPTIME": "long"})
     assert len(found.notes) == 2 and "tells no time of day" in found.notes[1]

@@ -136,6 +136,7 @@ def test_nothing_in_a_cache_is_run(stored_table, tmp_path):
 
 def test_nothing_depends_on_a_place_for_the_cache(stored_table, monkeypatch, tmp_path):
     (tmp_path / "file").write_text("no directory")
+    monkeypatch.chdir(tmp_path)
     for named in (str(tmp_path / "file"), "/proc/none", "relative"):
         monkeypatch.setenv("XDG_CACHE_HOME", named)
         monkeypatch.setenv("HOME", "/proc/none")

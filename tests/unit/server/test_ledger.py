@@ -319,7 +319,9 @@ def test_a_ledger_that_is_moved_touched_or_linked_is_whole(tmp_path, small_bench
         wait_for(lambda: notices.counts().get("ledger-moved"))
         keep(ledger, 10, 20)
     assert ledger.failure is None
-    assert notices.counts() == {"ledger-moved": 1}
+    counts = notices.counts()
+    counts.pop("disk-low", None)  # who tests may have a disk that is nearly full
+    assert counts == {"ledger-moved": 1}
     assert [frame.frame for frame in drawable_frames(tmp_path / "moved.mcap")] == list(range(20))
 
 

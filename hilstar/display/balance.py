@@ -119,7 +119,7 @@ class Balance:
         away = offset_px - nearest
         d = (offset_px - fraction).astype(np.float32)
         off = fraction - nearest
-        # An eighth power stands for exp(-u), within 0.03, to save the shader's time.
+        # An eighth power stands for exp(-u), within 0.033, to save the shader's time.
         sigma_x, sigma_y = self.window_px
         along_x = np.square(d[0] / np.float32(sigma_x))
         along_y = np.square(d[1] / np.float32(sigma_y))

@@ -11,7 +11,7 @@ Rates that are late fit and do not fit by turns: they are compared with the turn
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -105,6 +105,28 @@ class ReadAs:
             return cls(q_body_to_cam=q_body_to_cam, has_key=False)
         return cls(convention.scalar, convention.direction, q_body_to_cam, stated_by=stated_by)
 
+    def q_icrs_to_cam(self, sent: FloatArray) -> FloatArray:
+        """The camera's attitude (n, 4) by the four numbers that were sent."""
+        q = sent
+        if self.scalar == "last":
+            q = np.roll(q, 1, axis=-1)
+        if self.direction == "cam_to_icrs":
+            q = conjugate(q)
+        if self.q_body_to_cam is not None:
+            q = multiply(self.q_body_to_cam, q)
+        return q
+
+    def sent(self, q_icrs_to_cam: FloatArray) -> FloatArray:
+        """The four numbers (n, 4) that were sent for an attitude of the camera."""
+        q = q_icrs_to_cam
+        if self.q_body_to_cam is not None:
+            q = multiply(conjugate(self.q_body_to_cam), q)
+        if self.direction == "cam_to_icrs":
+            q = conjugate(q)
+        if self.scalar == "last":
+            q = np.roll(q, -1, axis=-1)
+        return q
+
     def advice(self, parts: Sequence[tuple[str, str]]) -> str:
         """What to write for another reading, by its keys and their values."""
         if not self.has_key:
@@ -119,52 +141,50 @@ AS_PACKETS = ReadAs()
 
 
 class Reading(NamedTuple):
-    """Another reading of a quaternion's four numbers: what it is, what to write for it, and
-    (n, 4) read by it.
+    """Another reading of a quaternion's four numbers: what it is, what to write for it, and how
+    the numbers are read now and by it.
     """
 
     text: str
     advice: str
-    read: Callable[[FloatArray], FloatArray]
+    now: ReadAs
+    other: ReadAs
 
-
-def _scalar_last(q: FloatArray) -> FloatArray:
-    return np.asarray(q[..., [3, 0, 1, 2]])
+    def read(self, q: FloatArray) -> FloatArray:
+        """Attitudes (n, 4) as they are read now, by this reading."""
+        return self.other.q_icrs_to_cam(self.now.sent(q))
 
 
 def readings(read_as: ReadAs = AS_PACKETS) -> tuple[Reading, ...]:
     """The other readings of quaternions that are read like this."""
-    readings_by_text, scalar, direction, mounting = (
-        [],
-        read_as.scalar,
-        read_as.direction,
-        read_as.q_body_to_cam,
-    )
-    for other_scalar, other_direction in itertools.product(
-        ("first", "last"), ("icrs_to_cam", "cam_to_icrs")
-    ):
-        if (other_scalar, other_direction) == (scalar, direction):
+    others = []
+    for scalar, direction in itertools.product(("first", "last"), ("icrs_to_cam", "cam_to_icrs")):
+        if (scalar, direction) == (read_as.scalar, read_as.direction):
             continue
-        text = "quaternions" if other_direction == direction else "conjugate of the quaternions"
-        text += "" if other_scalar == scalar else f" read with the scalar {other_scalar}"
-        parts = [("scalar", other_scalar)] if other_scalar != "first" or scalar != "first" else []
-        if other_direction != "icrs_to_cam" or direction != "icrs_to_cam":
-            parts.append(("direction", other_direction))
-        if mounting is not None:
-            parts.append(("frame", "body"))
+        other = replace(read_as, scalar=scalar, direction=direction)
+        others.append(Reading(_words(read_as, other), _advice(read_as, other), read_as, other))
+    return tuple(others)
 
-        def read(
-            q: FloatArray, turned: bool = other_direction != direction, to: str = other_scalar
-        ) -> FloatArray:
-            own_q = q if mounting is None else multiply(conjugate(mounting), q)
-            sent = conjugate(own_q) if direction == "cam_to_icrs" else own_q
-            sent = np.roll(sent, -1, axis=-1) if scalar == "last" else sent
-            sent = np.roll(sent, 1, axis=-1) if to == "last" else sent
-            own_q = conjugate(sent) if turned != (direction == "cam_to_icrs") else np.asarray(sent)
-            return own_q if mounting is None else multiply(mounting, own_q)
 
-        readings_by_text.append(Reading(text, read_as.advice(parts), read))
-    return tuple(readings_by_text)
+def _words(now: ReadAs, other: ReadAs) -> str:
+    words = "quaternions"
+    if other.direction != now.direction:
+        words = "conjugate of the quaternions"
+    if other.scalar != now.scalar:
+        words += f" read with the scalar {other.scalar}"
+    return words
+
+
+def _advice(now: ReadAs, other: ReadAs) -> str:
+    """What to write for another reading; a default that holds now and then need not be written."""
+    parts = []
+    if (now.scalar, other.scalar) != ("first", "first"):
+        parts.append(("scalar", other.scalar))
+    if (now.direction, other.direction) != ("icrs_to_cam", "icrs_to_cam"):
+        parts.append(("direction", other.direction))
+    if now.q_body_to_cam is not None:
+        parts.append(("frame", "body"))
+    return now.advice(parts)
 
 
 @dataclass(slots=True)

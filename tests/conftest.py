@@ -66,6 +66,14 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     return selection.holds_nothing_for(config, collection_path) or None
 
 
+def pytest_pycollect_makeitem(
+    collector: pytest.Module, name: str, obj: object
+) -> list[pytest.Item] | None:
+    if selection.is_of_the_bare_command(collector.config, collector.path, name, obj):
+        return []
+    return None
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark what lies in a folder, and leave out what the command does not ask for."""
     for item in items:

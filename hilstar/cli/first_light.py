@@ -38,7 +38,7 @@ MAX_AVERAGE = 1000  # images that verify averages
 
 def steps() -> Iterable[str]:
     """The steps that --again takes."""
-    from hilstar.instruments.calibrate.first_light.session import NAMES
+    from hilstar.instruments.calibrate.first_light.steps import NAMES
 
     return NAMES
 
@@ -87,10 +87,10 @@ def first_light(options: FirstLightOptions, images: ImageOptions, page: ActingPa
     from hilstar.instruments.calibrate.first_light.page import write_page
     from hilstar.instruments.calibrate.first_light.session import (
         BEFORE_FILE,
-        NAMES,
         FirstLightSession,
         alone_in,
     )
+    from hilstar.instruments.calibrate.first_light.steps import NAMES
     from hilstar.server.bench.bench_file import read_bench_file
     from hilstar.server.sync import beat_line
 

@@ -4,10 +4,9 @@ and the photodiode's square.
 
 from __future__ import annotations
 
-import subprocess
 import sys
 
-from tests.support.waiting import PATIENCE_S
+from tests.support.commands import run_started
 
 RUN = """
 import numpy as np
@@ -77,12 +76,5 @@ print("presented")
 
 
 def test_a_window_shows_what_numpy_presents(screen):
-    ran = subprocess.run(
-        [sys.executable, "-c", RUN],
-        capture_output=True,
-        text=True,
-        env=screen.env,
-        timeout=PATIENCE_S,
-        check=False,
-    )
+    ran = run_started([sys.executable, "-c", RUN], env=screen.env)
     assert ran.stdout == "presented\n", ran.stderr

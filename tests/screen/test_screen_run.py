@@ -168,19 +168,14 @@ from hilstar.basics.resources import resource_path
 with load(resource_path("configs", "demo.toml")) as bench:
     loop = FrameLoop(bench, moving=True)
     turning = Attitude(from_radec_roll_deg(84, 0, 0), 0, False, rate_cam_rad_s=np.array([0.001, 0.01, 0.0]))
-    for number in range(30):
+    for number in range(10):
         loop.draw(number, 0, turning)
     gc.collect()
     gc.disable()
-    for number in range(100):
+    for number in range(30):
         loop.draw(number, 0, turning)
     print(gc.collect())
 """
-    result = subprocess.run(
-        [sys.executable, "-c", program],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        check=True,
-    )
+    result = run_started([sys.executable, "-c", program])
+    assert result.returncode == 0, result.stderr
     assert int(result.stdout) == 0

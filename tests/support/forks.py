@@ -54,6 +54,13 @@ COMMANDS = (
 )
 # What these commands import as they go; each takes 0.2 s to a second.
 LATER = {
+    "tests.support.sources.basilisk_run": (
+        "Basilisk.architecture.messaging",
+        "Basilisk.simulation.simSynch",
+        "Basilisk.simulation.spacecraft",
+        "Basilisk.utilities.SimulationBaseClass",
+        "Basilisk.utilities.vizSupport",
+    ),
     "campaign": (
         "hilstar.instruments.campaign.results",
         "hilstar.instruments.campaign.requirements_page",

@@ -112,6 +112,19 @@ def holds_nothing_for(config: pytest.Config, path: Path) -> bool:
     return not is_slow and "study" not in folders and not REASONS_BY_FOLDER.keys() & set(folders)
 
 
+def is_of_the_bare_command(config: pytest.Config, path: Path, name: str, test: object) -> bool:
+    """Whether `--rest` takes no case of a file's function: its cases need not be made, which are
+    four fifths of all.
+    """
+    if not config.option.rest or config.option.all or not name.startswith("test_"):
+        return False
+    if "study" in folders_of(path) or REASONS_BY_FOLDER.keys() & set(folders_of(path)):
+        return False
+    if any(mark.name == "timing" for mark in getattr(test, "pytestmark", ())):
+        return False
+    return f"{path.relative_to(TESTS.parent).as_posix()}::{name}" not in SLOW
+
+
 def select(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Take out of `items`, in place, what this command leaves out, and count it by reason."""
     option = config.option

@@ -12,6 +12,7 @@ from tests.support.selection import (
     TESTS,
     holds_nothing_for,
     is_bare,
+    is_of_the_bare_command,
     is_slow,
     slow_functions,
 )
@@ -52,6 +53,21 @@ def test_a_file_is_imported_for_the_tests_that_are_asked_for():
     assert imported() == imported(all=True) == [True] * 4
     assert imported(rest=True)[:3] == [False, True, True]
     assert imported(timing=True) == [False, False, False, True]
+
+
+def test_of_the_bare_command_s_functions_no_cases_are_made_for_the_rest():
+    file, _, slow = next(name for name in sorted(SLOW) if "tests/unit/" in name).partition("::")
+    path = TESTS.parent / file
+    rest = asking_for(rest=True)
+    timed = SimpleNamespace(pytestmark=[SimpleNamespace(name="timing")])
+    assert is_of_the_bare_command(rest, path, "test_another", None)
+    assert not is_of_the_bare_command(rest, path, slow, None)
+    assert not is_of_the_bare_command(rest, path, "helper", None)
+    assert not is_of_the_bare_command(rest, path, "test_another", timed)
+    for other in (asking_for(), asking_for(rest=True, all=True), asking_for(timing=True)):
+        assert not is_of_the_bare_command(other, path, "test_another", None)
+    for folder in ("screen", "e2e/browser", "study"):
+        assert not is_of_the_bare_command(rest, TESTS / folder / "test_a.py", "test_another", None)
 
 
 def test_a_slow_function_s_cases_that_stand_below_it_are_not_left_out():

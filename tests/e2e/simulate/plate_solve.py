@@ -1,10 +1,14 @@
-"""Run by the plate solver's own Python: centroids in as JSON lines, solved attitudes out."""
+"""Run beside the plate solver: centroids in as JSON lines, solved attitudes out."""
 
 import json
+import math
 import sys
 
 import numpy as np
-import tetra3
+
+np.math = math  # a name of NumPy 1 that the solver takes a factorial by
+
+import tetra3  # noqa: E402
 
 solver = tetra3.Tetra3()
 for line in sys.stdin:

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from tests.support.forks import Started
 from tests.support.waiting import PATIENCE_S
 
-SCRIPT = Path(__file__).with_name("basilisk_run.py")
+MODULE = "tests.support.sources.basilisk_run"
 
 
 class Basilisk:
@@ -39,7 +40,7 @@ def basilisk(folder: Path, **scenario: Any) -> Iterator[Basilisk]:
     path.write_text(json.dumps(whole))
     with said.open("w") as file:
         told = {"stdin": subprocess.PIPE, "stdout": file, "stderr": subprocess.STDOUT, "text": True}
-        with subprocess.Popen([sys.executable, SCRIPT, path], cwd=folder, **told) as process:
+        with Started([sys.executable, "-m", MODULE, str(path)], cwd=folder, **told) as process:
             try:
                 yield Basilisk(process, said)
             finally:

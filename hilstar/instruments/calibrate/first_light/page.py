@@ -29,7 +29,7 @@ from hilstar.basics.pages import (
 )
 from hilstar.basics.reading import MAX_TOML_BYTES, read_bytes, read_text
 from hilstar.instruments.calibrate.first_light.context import SessionFile, StepRecord
-from hilstar.instruments.calibrate.first_light.session import STEPS, SessionStep
+from hilstar.instruments.calibrate.first_light.steps import STEPS, SessionStep
 from hilstar.server.sync import beat_line
 
 PAGE_FILE = "first-light.html"

@@ -45,6 +45,7 @@ from hilstar.instruments.calibrate.first_light.image_sources import (
 )
 from hilstar.instruments.calibrate.first_light.photometry import photometry
 from hilstar.instruments.calibrate.first_light.stars import scale, verify
+from hilstar.instruments.calibrate.first_light.steps import STEPS, SessionStep
 from hilstar.instruments.calibrate.first_light.uniformity import uniformity, warm_up
 from hilstar.instruments.calibrate.latency import checked_delay_ms, draw_latency, pair, summarise
 from hilstar.server.bench.bench_file import BenchFile
@@ -57,7 +58,6 @@ MS_PER_S = 1000.0
 PROGRESS_S = 3.0
 BEFORE_FILE = "bench-before.toml"
 LOCK_FILE = ".lock"
-STEPS_FILE = Path(__file__).with_name("steps.toml")
 
 
 def latency(context: StepContext) -> StepOutcome:
@@ -159,33 +159,6 @@ def display(context: StepContext) -> StepOutcome:
     return StepOutcome("done", line, figures, number=number)
 
 
-class SessionStep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One step of steps.toml: what it measures, and what to do where it fails; what it shows, and
-    what it wants back.
-
-    `tables` are those of the bench file that it depends on; `writes` has the keys that it may set,
-    `needs` the steps before it. Those of `unless_failed` may be skipped: what the bench file says
-    stands in for them.
-    """
-
-    measures: str
-    cure: str
-    wants: str
-    shows: str = ""
-    needs: tuple[str, ...] = ()
-    unless_failed: tuple[str, ...] = ()
-    tables: tuple[str, ...] = ("monitor", "collimator", "tracker")
-    writes: tuple[str, ...] = ()
-    name: str = ""
-
-
-STEPS = tuple(
-    msgspec.structs.replace(step, name=name)
-    for name, step in msgspec.toml.decode(
-        STEPS_FILE.read_bytes(), type=dict[str, SessionStep]
-    ).items()
-)
-NAMES = tuple(step.name for step in STEPS)
 RUNS: dict[str, Callable[[StepContext], StepOutcome]] = {
     run.__name__.replace("_", "-"): run
     for run in (

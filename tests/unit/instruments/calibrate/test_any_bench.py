@@ -32,7 +32,6 @@ from hilstar.instruments.calibrate.first_light.image_sources import ImageSource
 from hilstar.instruments.calibrate.first_light.photometry import rounds_alike
 from hilstar.instruments.calibrate.first_light.seen_stars import Beyond, StarSpot
 from hilstar.instruments.calibrate.first_light.session import (
-    NAMES,
     FirstLightSession,
     Progress,
     SessionPlan,
@@ -42,6 +41,7 @@ from hilstar.instruments.calibrate.first_light.stars import (
     noise_words,
     place_reasons,
 )
+from hilstar.instruments.calibrate.first_light.steps import NAMES
 from hilstar.instruments.calibrate.geometric.dot_shape import DotShape, without_s_curve
 from hilstar.instruments.calibrate.geometric.dots import (
     DOT_PX,

@@ -46,8 +46,8 @@ from hilstar.instruments.calibrate.first_light.image_sources import (
 from hilstar.instruments.calibrate.first_light.session import (
     FirstLightSession,
     SessionPlan,
-    SessionStep,
 )
+from hilstar.instruments.calibrate.first_light.steps import SessionStep
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.optics.scan import Orientation
 from hilstar.server.bench.bench_file import read_bench_file
@@ -583,6 +583,13 @@ def test_a_directory_of_another_bench_is_refused(counted, tmp_path):
 def test_a_session_file_that_is_none_is_refused(counted, tmp_path, data):
     (tmp_path / "s" / "session.json").write_bytes(data)
     assert "is no session" in refusal(counted.go, tmp_path)
+
+
+def test_a_session_file_of_another_kind_is_refused(counted, tmp_path):
+    counted.go(tmp_path)
+    path = tmp_path / "s" / "session.json"
+    path.write_text(path.read_text().replace('"kind": "', '"kind": "another '))
+    assert "kind = 'another " in refusal(counted.go, tmp_path)
 
 
 def test_a_key_that_cannot_be_set_leaves_the_file_alone(tmp_path):

@@ -6,7 +6,7 @@ import pytest
 
 from hilstar.instruments.calibrate.first_light.context import SessionFile, StepRecord
 from hilstar.instruments.calibrate.first_light.page import write_page
-from hilstar.instruments.calibrate.first_light.session import STEPS
+from hilstar.instruments.calibrate.first_light.steps import STEPS
 
 
 def page_of_session(folder, changes: dict[str, dict], steps: int = len(STEPS)) -> str:

@@ -21,13 +21,12 @@ from hilstar.instruments.calibrate.first_light.image_sources import complete_ima
 from hilstar.instruments.calibrate.first_light.photometer import _seen
 from hilstar.instruments.calibrate.first_light.session import (
     FIRST_LIGHT,
-    STEPS,
     FirstLightSession,
     SessionPlan,
-    SessionStep,
     origin_of,
     state_sha256,
 )
+from hilstar.instruments.calibrate.first_light.steps import STEPS, SessionStep
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.optics.camera import Camera
 from hilstar.server.bench.bench_file import BenchConfig

@@ -115,6 +115,8 @@ JITTER = {"key": "jitter_arcsec.across", "values": [10.0]}
 HZ = {"key": "jitter_hz", "values": [10.0]}
 SLEW = {"key": "motion_s", "values": [2.0]}
 PLANS += [
+    (plan_text(answers=2), 'answers: is for through = "bench"; write that, or leave answers out'),
+    (plan_text(through="bench", frames=2), 'frames: is for through = "tracker" or "display";'),
     (plan_text(JITTER), "go together"),
     (plan_text(HZ), "go together"),
     (

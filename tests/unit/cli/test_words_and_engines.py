@@ -21,6 +21,7 @@ from astropy.io import fits
 from hilstar.attitude.wire.packet import Status, TimeRequest, encode
 from hilstar.attitude.wire.shown_frames import FrameHead, ShownFrame
 from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.basics.running_statistics import Percentiles
 from hilstar.basics.units import NS_PER_S
 from hilstar.cli import demo as demo_command
@@ -753,6 +754,20 @@ def test_a_log_s_exposures_have_the_faults_of_a_scenario(
         assert run_hilstar_here(*words, *more, cwd=tmp_path).returncode == 0
     without, faults = given
     assert without is None and faults is not None
+
+
+def test_an_attitude_is_told_with_its_rate_in_degrees_and_its_stars_places(tmp_path: Path) -> None:
+    tables = {"tracker": {"resolution_px": [300, 200]}, "sky": {"faintest_v_mag": 4.0}}
+    (tmp_path / "bench.toml").write_text(bench_text(tables))
+    q = ",".join(map(repr, from_radec_roll_deg(84.057, -1.2, 0.0).tolist()))
+    (tmp_path / "log.csv").write_text(f"t_s,qw,qx,qy,qz,rx,ry,rz\n0,{q},0.01,-0.02,0.04\n")
+    words = ("attitude", "log.csv", "--bench", "bench.toml")
+    told = json.loads(run_hilstar_here(*words, "--json", cwd=tmp_path).stdout)
+    assert told["rate_deg_s"] == pytest.approx(np.degrees([0.01, -0.02, 0.04]))
+    said = run_hilstar_here(*words, cwd=tmp_path).stdout.splitlines()
+    assert said[1] == "RA 84.0570, Dec -1.2000, roll 0.0000 deg"
+    assert said[2] == "rate 0.572958, -1.145916, 2.291831 deg/s about x, y, z of the camera"
+    assert "of 300 x 200 px" in said[3]
 
 
 def test_a_study_s_figures_are_not_written_over_its_bench(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ and benches that have none.
 from __future__ import annotations
 
 import json
+import re
 from functools import cache
 
 import numpy as np
@@ -248,11 +249,17 @@ def test_what_the_file_does_not_cover_is_said(glass_file, caplog):
         {"tracker": {"resolution_px": [300, SIDE_PX]}, "tracker.optics": {"focus_um": 7.0}}
     )
     assert isinstance(tracker_psf(wide.config.tracker, wide.folder), GlassPsf)
+    optics = bench_optics(wide.config.tracker, wide.folder)
+    nm = np.arange(250.0, 1200.0, 0.5)
+    response = optics.quantum_efficiency(nm) * optics.transmission(nm)
+    told = dict(re.findall(r"(under|over) the file's (\d+) nm", caplog.text))
+    assert told == {"under": "450", "over": "750"}
+    percents = [int(text) for text in re.findall(r"(\d+)% of the light is", caplog.text)]
+    for percent, is_beyond in zip(percents, (nm < 450, nm > 750), strict=True):
+        assert percent == pytest.approx(100 * response[is_beyond].sum() / response.sum(), abs=0.6)
     for words in (
         "44 px beyond the file's points",
         "focus_um = 7 is beyond",
-        "under the file's 450 nm",
-        "over the file's 750 nm",
     ):
         assert words in caplog.text
 

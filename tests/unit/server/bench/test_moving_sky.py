@@ -7,9 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.server.bench.bench_file import at_moment, read_bench_file
 from hilstar.server.bench.moving_sky import orbit_file, satellite_lines, wide_bodies
-from hilstar.server.bench.star_light import bench_moving
+from hilstar.server.bench.star_light import bench_moving, bench_stars
+from hilstar.sky.stars import unit_vectors_icrs
 from tests.support.benches import bench_text
 from tests.support.satellites import some_orbits
 from tests.support.skies import STATION_TLE, STATION_UTC, utc_ns
@@ -57,6 +59,24 @@ def test_elements_of_a_sky_in_unix_time_are_as_old_as_at_the_day_of_its_stars(
         "satellites: 3 of 3 have a place by their elements; 2 are in [sky.bodies]"
         " satellite_magnitudes"
     )
+
+
+def test_a_near_star_is_seen_from_where_the_observer_is(tmp_path):
+    """By its parallax times what of the Earth's place, 0.98 to 1.02 AU, lies across it."""
+    path = tmp_path / "bench.toml"
+    sky = {"epoch_utc": "2026-03-20T12:00:00", "faintest_v_mag": 2.0}
+    path.write_text(bench_text({"sky": sky, "spacecraft": {"orbit": "geocentre"}}))
+    file = read_bench_file(path)
+    moving = bench_moving(file.config, file.folder)
+    stars = bench_stars(file.config, file.folder, moving)
+    from_sun = unit_vectors_icrs(stars.catalog, file.config.sky.epoch_jyear)
+    far = moving.stars_seen(from_sun, np.zeros(len(from_sun)))
+    seen = np.zeros_like(far)
+    seen[stars.row] = stars.vectors
+    moved_mas = np.linalg.norm(seen - far, axis=1) * ARCSEC_PER_RAD * 1e3
+    near = stars.catalog.parallax_mas > 100
+    share = moved_mas[near] / stars.catalog.parallax_mas[near]
+    assert near.sum() > 5 and share.max() < 1.021 and np.median(share) > 0.5
 
 
 def test_bodies_are_told_from_the_widest_on_with_their_pixels():

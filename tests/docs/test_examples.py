@@ -145,7 +145,8 @@ def type_in(block: Block, ports: Ports) -> None:
                 words.append(f"127.0.0.1:{ports['8765']}")
             if block.figures_vary and "--duration" in words:
                 at = words.index("--duration") + 1
-                longest_s = MAX_ASSESSED_S if "--ledger" in words else MAX_DURATION_S
+                # a run that a tracker is fed from is assessed
+                longest_s = MAX_ASSESSED_S if "--feed" in words else MAX_DURATION_S
                 words[at] = str(min(float(words[at]), longest_s))
             # each worker is a process, which takes a second to start
             if words[:2] in (["hilstar", "campaign"], ["hilstar", "accept"]):

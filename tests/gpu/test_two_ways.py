@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilstar.basics.notices import Notices
+from hilstar.basics.notices import Notice, Notices
 from hilstar.display.panel import Panel
 from hilstar.display.quantise import Quantisation
 from hilstar.display.quantisers import QUANTISERS
@@ -191,13 +191,13 @@ def replayed_codes(path, log, ledger=None) -> tuple[dict[int, np.ndarray], list[
     """The codes of each frame of a replay, what was told of another renderer, and who drew it."""
     codes, told = {}, []
 
-    class Told(Notices):
-        def tell(self, kind, detail, who=""):
-            told.extend([detail] * (kind == "other-renderer"))
-            super().tell(kind, detail, who)
+    def listen(notice: Notice) -> None:
+        if notice.kind == "other-renderer":
+            told.append(notice.detail)
 
     with load(path) as bench:
-        notices = Told()
+        notices = Notices()
+        notices.listen(listen)
         kept = LedgerSwitch(None if ledger is None else Ledger(ledger, bench, notices))
         play = plan_play(log, Wanted(math.inf), bench.config)
         replay(

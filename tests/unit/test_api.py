@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import pickle
+import re
 import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 import hilstar
 from hilstar.api import OpenBench, _unit_of, _unit_quaternion
+from hilstar.instruments.assess import assessment
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.server.bench.frame import Bench
 from hilstar.testing import compare
@@ -105,8 +108,9 @@ def test_a_wrong_rate_is_one_line(bench, rate):
 def test_a_roll_beside_a_quaternion_is_refused(bench):
     with pytest.raises(hilstar.InputError, match="roll_deg"):
         bench.frame(BELT, roll_deg=3.0)
-    with pytest.raises(hilstar.InputError, match="roll_deg"):
-        bench.draw(None, roll_deg=3.0)
+    for roll_deg in (3.0, 0.0):
+        with pytest.raises(hilstar.InputError, match="roll_deg"):
+            bench.draw(None, roll_deg=roll_deg)
 
 
 def test_quantities_are_numbers_in_their_units(bench):
@@ -161,6 +165,24 @@ def test_a_frame_and_a_bench_are_one_line_and_a_picture(bench):
         assert shown._repr_html_().count("<tr>") == figures
     assert str(len(frame.truth)) in repr(frame)
     assert "data:image/png;base64," in frame._repr_html_()
+    # the outlines of both fields lie about the middle
+    outlines = re.findall(
+        r'<rect x="(\S+)" y="(\S+)" width="(\S+)" height="(\S+)"', bench._repr_html_()
+    )
+    assert len(outlines) == 2
+    for outline in outlines:
+        x, y, width, height = map(float, outline)
+        assert (-2 * x, -2 * y) == pytest.approx((width, height), rel=1e-5)
+
+
+def test_an_assessment_s_latency_is_in_seconds_or_any_unit_of_time(monkeypatch):
+    asked = []
+    monkeypatch.setattr(assessment, "assess_files", lambda *given: asked.append(given))
+    for latency_s in (-0.0025, -2.5 * u.ms):
+        hilstar.assess("run.mcap", stamp="end", latency_s=latency_s, display_attitudes=3)
+    (first, again) = asked
+    assert first == (Path("run.mcap"), None, assessment.AssessSettings("end", -0.0025, 3))
+    assert again[2].latency_s == pytest.approx(-0.0025)
 
 
 def test_a_frame_is_its_linear_image(bench):

@@ -21,7 +21,7 @@ from hilstar.display.primaries import read_primaries
 from hilstar.instruments.calibrate.attitude_pairs import read_pairs
 from hilstar.instruments.calibrate.first_light.context import SESSION_FILE, read_session
 from hilstar.instruments.calibrate.geometric.dots import read_plan as read_dots
-from hilstar.instruments.calibrate.geometric.observed import read_observed
+from hilstar.instruments.calibrate.geometric.observed import read_exposed, read_observed
 from hilstar.instruments.calibrate.latency import read_edges
 from hilstar.instruments.calibrate.measurements import read_measurements
 from hilstar.instruments.calibrate.reference import read_readings
@@ -42,6 +42,7 @@ from hilstar.server.bench.scenario import read_scenario
 from hilstar.sky.catalog import read_hip_main
 from hilstar.sky.diffuse import read_diffuse_map
 from hilstar.sky.spectrum import read_curve_csv
+from hilstar.sky.table_reader import read_table
 from tests.support.refusals import assert_file_refused
 
 CAMERA = monitor_camera((320, 240), 57.65, 60.0, np.array([1.0, 0.0, 0.0, 0.0]))
@@ -87,10 +88,12 @@ READERS: list[tuple[Callable[[Path], object], str, int, str]] = [
     (read_telemetry, "telemetry.csv", 500 * MB, ""),
     (read_glass, "glass.fits", 500 * MB, ""),
     (lambda path: read_photographs(path, (9, 9), None), "photo.fits", 500 * MB, ""),
+    (read_exposed, "exposed.fits", 500 * MB, ""),
     (read_frame_fits, "frame.fits", 600 * MB, ""),
     (read_diffuse_map, "map.fits", 1000 * MB, ""),
+    (read_table, "stars.csv", 4000 * MB, ""),
 ]
-SAID = {200 * KB: "200 kB", MB: "1 MB", 1000 * MB: "1 GB"}
+SAID = {200 * KB: "200 kB", MB: "1 MB", 1000 * MB: "1 GB", 4000 * MB: "4 GB"}
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ import pytest
 from hilstar.instruments.calibrate.warm_up import WarmUp
 from hilstar.instruments.certify import certificate as certificates
 from hilstar.instruments.certify import check as checks
+from hilstar.instruments.certify import readings
 from hilstar.instruments.certify.check import CheckFigure
 from hilstar.instruments.certify.readings import ImageReader, VirtualReader
 from tests.support.benches import bench_text
@@ -190,15 +191,16 @@ def test_a_check_says_whether_the_bench_has_moved_and_since_when(
 
 
 def test_checks_are_counted_and_each_draws_other_figures(
-    folder: Path, figures: list[CheckFigure]
+    folder: Path, figures: list[CheckFigure], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    counts = []
+    counts, turns = [], []
+    monkeypatch.setattr(readings, "VirtualReader", lambda *given: turns.append(given[-1]) or given)
     for _ in range(2):
         told = json.loads(certify(folder, "--check", "--json", virtual=True).stdout)
         assert told["in_tolerance"] is True and told["warm_up"] is None
         assert [each["quantity"] for each in told["figures"]] == ["shift", "focus"]
         counts.append(told["checks"])
-    assert counts == [1, 2]
+    assert counts == [1, 2] and 0 < turns[0] < turns[1]  # the certificate's own are 0
     figures[0] = figure("shift", 9.0, False)
     third = certify(folder, "--check", "--json", virtual=True)
     assert third.returncode == 1

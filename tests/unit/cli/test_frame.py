@@ -34,6 +34,19 @@ def test_what_a_clipped_false_star_loses_is_said_with_the_stars(small_bench_file
     assert told["clipped_mag"]["ghost"] > 1
 
 
+def test_what_is_too_faint_to_show_is_said_with_its_percent_of_the_light(
+    small_bench_file, tmp_path
+):
+    text = small_bench_file.read_text()
+    small_bench_file.write_text(text + "[render]\nflux_at_white_e_per_s = 3e8\n")
+    words = ("frame", small_bench_file, "--radec", "84,-1,0", "--codes", tmp_path / "codes.png")
+    missing = json.loads(run_hilstar_here(*words, "--json").stdout)["left_out"]
+    percent = 100 * missing["flux_share"]
+    assert missing["stars"] > 0 and percent > 0.1
+    line = f"{missing['stars']} too faint to show ({percent:.2f}% of all light)"
+    assert line in run_hilstar_here(*words).stdout
+
+
 def test_codes_are_written_with_the_monitor_s_bits_and_faults_as_they_are_then(
     small_bench_file, tmp_path, monkeypatch
 ):

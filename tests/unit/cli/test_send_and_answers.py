@@ -12,7 +12,7 @@ from tests.support.senders import free_port
 
 ANSWERS = '[answers]\nsource = "file"\npath = "line.bin"\nformat = "json"\n'
 LINES = [
-    '{"q": [1, 0, 0, 0], "t_ns": 5}',
+    '{"q": [1, 0, 0, 0], "t_ns": 1000}',
     '{"q": [1, 0, 0, 0], "t_ns": 6, "valid": false}',
     "no answer",
     '{"q": [0, 1, 0, 0], "t_ns": 7}',
@@ -31,6 +31,25 @@ def test_a_cable_s_faults_add_up_to_every_packet_at_most(lost, corrupted, reorde
     shares = ["--lose", lost, "--corrupt", corrupted, "--reorder", reordered]
     refused = run_hilstar_here("send", "gone.jsonl", *shares)
     assert refused.returncode == 2 and words in refused.stderr
+
+
+@pytest.mark.parametrize(
+    ("rate", "words"),
+    [
+        ("0.001", None),
+        ("10000", None),
+        ("0.0009", "--rate 0.0009: write packets per second, 0.001 to 10000"),
+        ("10001", "--rate 10001: write packets per second, 0.001 to 10000"),
+    ],
+)
+def test_packets_leave_from_one_in_a_thousand_seconds_to_ten_a_millisecond(rate, words):
+    to = f"udp://127.0.0.1:{free_port()}"
+    spin = ("send", "--spin", "z,0", "--to", to, "--wait", "0", "--duration", "0.0001", "--json")
+    sent = run_hilstar_here(*spin, "--rate", rate)
+    if words is None:
+        assert json.loads(sent.stdout)["packets"] == 1
+    else:
+        assert sent.returncode == 2 and words in sent.stderr
 
 
 @pytest.mark.parametrize(("duration", "packets"), [("0.1", 3), ("0.04", 2)])
@@ -60,4 +79,6 @@ def test_recorded_answers_are_counted_valid_ones_apart_and_refused_ones_by_reaso
     assert [bytes.fromhex(row["raw"]).decode() for row in rows][:2] == LINES[:2]
     spoken = run_hilstar_here(*words, cwd=tmp_path)
     assert f"3 answers, 2 valid; refused: 1 {reason}" in spoken.stderr
-    assert len(spoken.stdout.splitlines()) == 4
+    said = spoken.stdout.splitlines()
+    assert len(said) == 4
+    assert said[0].startswith("t 0.000001 s, q +1.0000000 +0.0000000 +0.0000000 +0.0000000, RA ")

@@ -16,6 +16,7 @@ from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
+from astropy.io import fits
 
 from hilstar.attitude.wire.packet import Status, TimeRequest, encode
 from hilstar.attitude.wire.shown_frames import FrameHead, ShownFrame
@@ -49,6 +50,7 @@ from hilstar.cli.study import (
     StudyOptions,
     findings_of,
     refuse_unused,
+    thesis_lines,
 )
 from hilstar.cli.tracker import (
     TrackerOptions,
@@ -68,12 +70,13 @@ from hilstar.instruments.campaign import acceptance_page, acceptance_plan, pool
 from hilstar.instruments.campaign.acceptance_plan import CaseSet
 from hilstar.instruments.campaign.acceptance_verdicts import CostOfSet
 from hilstar.instruments.campaign.requirements import NOT_MET
+from hilstar.instruments.simulate import batch, simulator
 from hilstar.instruments.simulate import heads as twin_heads
-from hilstar.instruments.simulate import simulator
 from hilstar.instruments.simulate.answer_link import AnswerLink
 from hilstar.instruments.simulate.heads import HeadsErrors
 from hilstar.instruments.simulate.live_exposure import WatchedFrames
 from hilstar.instruments.simulate.tracker_process import SILENT_AFTER_S, Planted
+from hilstar.instruments.study import rapp
 from hilstar.instruments.study.chain import run as chain
 from hilstar.instruments.study.engine import ChartFinding
 from hilstar.instruments.study.stability import CaseFigures, FailureCase
@@ -726,6 +729,38 @@ def test_an_acceptance_s_sets_are_run_by_one_pool_that_turns_to_each(
 def test_a_duration_has_the_unit_that_gives_it_two_or_three_digits() -> None:
     times = [_time_text(seconds) for seconds in (9.0, 119.0, 120.0, 7199.0, 7200.0, 36e3)]
     assert times == ["9 s", "119 s", "2 min", "120 min", "2.0 h", "10.0 h"]
+
+
+def test_an_exposure_is_summed_up_by_its_numbers(tmp_path: Path) -> None:
+    (tmp_path / "bench.toml").write_text(bench_text({"tracker": {"resolution_px": [128, 96]}}))
+    words = ("simulate", "bench.toml", "--radec", "84,-1,0", "-o", "o.fits", "--json")
+    told = json.loads(run_hilstar_here(*words, cwd=tmp_path).stdout)
+    dn = fits.getdata(tmp_path / "o.fits")
+    assert told["dn"] == {"min": dn.min(), "mean": pytest.approx(dn.mean()), "max": dn.max()}
+    assert told["written"] == ["o.fits"] and told["faults"] == []
+
+
+def test_a_log_s_exposures_have_the_faults_of_a_scenario(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = []
+    monkeypatch.setattr(batch, "simulate_views", lambda *parts: given.append(parts[-1]))
+    (tmp_path / "bench.toml").write_text(bench_text())
+    (tmp_path / "log.csv").write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n1,1,0,0,0\n")
+    (tmp_path / "cover.toml").write_text('[[fault]]\nkind = "blank"\nname = "b"\nat_s = 0.5\n')
+    words = ("simulate", "bench.toml", "--log", "log.csv", "-o", "out")
+    for more in ((), ("--scenario", "cover.toml")):
+        assert run_hilstar_here(*words, *more, cwd=tmp_path).returncode == 0
+    without, faults = given
+    assert without is None and faults is not None
+
+
+def test_a_study_s_figures_are_not_written_over_its_bench(tmp_path: Path) -> None:
+    bench = tmp_path / rapp.BENCH_FILES[0]
+    bench.write_text(bench_text())
+    assert "is read or written by this command already" in refusal(
+        thesis_lines, "models", bench, tmp_path, None
+    )
 
 
 def test_a_scenario_gives_an_exposure_its_moments(

@@ -11,6 +11,7 @@ from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.senders import free_port
 
 BENCH = str(ROOT / "examples" / "bench.toml")
+README = str(ROOT / "README.md")
 MEANT = "84.057,-1.2,0, with commas and without spaces"
 
 
@@ -46,6 +47,23 @@ MEANT = "84.057,-1.2,0, with commas and without spaces"
         (["frame", "--star", "Proxima", "Centauri,30", BENCH], "--star 'Proxima Centauri,30'"),
         (["frame", BENCH, "--star=HIP", "27989", "-o", "o.fits"], "write --star 'HIP 27989'"),
         (["frame", BENCH, "--star", "Vega", "spare"], "unexpected extra argument(s) (spare)"),
+        (["attitude", BENCH, "--time", "3"], "a live stream has only its present"),
+        (
+            ["budget", BENCH, "--noise", "--centroider", "box5"],
+            "budget --noise: has every centroider",
+        ),
+        (
+            ["convert", README, "o.csv", "--mounting", "1,0,0,0", "--convention", "frame=cam"],
+            "write frame=body, or leave out --mounting",
+        ),
+        (
+            ["latency", README, "--edges", BENCH, "--write", BENCH],
+            "is read or written by this command already",
+        ),
+        (
+            ["calibrate", "reference", BENCH, "-o", BENCH],
+            "is read or written by this command already",
+        ),
         (["calibrate", "--nonsense"], "No such option: --nonsense; write it after a command"),
         (
             ["simulate", BENCH, "--radec", "1,2,3", "--slew", "0", "1", "0", "-o", "o.fits"],

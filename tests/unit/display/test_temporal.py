@@ -130,9 +130,7 @@ def test_a_fast_star_has_its_light_and_its_middle():
         )
 
 
-@pytest.mark.parametrize(
-    ("bits", "steps"), [(8, 30.3), (8, 0.43), (2, 12.2), (1, 4.7), (1, 0.43), (1, 0.031)]
-)
+@pytest.mark.parametrize(("bits", "steps"), [(8, 30.3), (2, 12.2), (1, 0.43), (1, 0.031)])
 def test_on_few_equal_levels_the_light_of_any_exposure_is_within_a_step(bits, steps):
     """No panel could do better; and its place is then right with the number of frames."""
     panel = Panel(linear(bits), WHITE)

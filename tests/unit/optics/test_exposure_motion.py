@@ -174,8 +174,8 @@ def test_a_turn_too_long_to_draw_is_refused_with_what_can_be(rate):
 
 
 def longest_turn_deg(sigma_px: tuple[float, float]) -> float:
-    """What the refusal of a turn about the boresight of 10 revolutions says can be drawn."""
-    at = motion((0, 0, 3600.0))
+    """What the refusal of a turn about the boresight of 1000 revolutions says can be drawn."""
+    at = motion((0, 0, 360_000.0))
     line = refusal(smeared_sprites, star_on((160.2, 120.7), at), at, CAMERA, GaussianPsf(sigma_px))
     return float(line.partition("at most ")[2].partition(" deg")[0])
 
@@ -184,8 +184,13 @@ def test_a_turn_as_long_as_its_refusal_says_is_drawn_and_a_longer_one_is_not(mon
     """The narrower axis of the PSF limits it, whichever that is."""
     monkeypatch.setattr(smear, "MAX_PIECES", 6)
     said_deg = longest_turn_deg(SIGMA)
-    for sigma_px in ((0.6, 0.85), (0.6, 0.6)):
-        assert longest_turn_deg(sigma_px) == pytest.approx(said_deg)
+    monkeypatch.setattr(smear, "MAX_PIECE_SIGMA", 10.0)  # the path, and not the angle, is too long
+    narrow_deg = longest_turn_deg((0.6, 0.6))
+    assert narrow_deg < 0.9 * longest_turn_deg((0.85, 0.85))
+    for sigma_px in (SIGMA, SIGMA[::-1]):
+        assert longest_turn_deg(sigma_px) == pytest.approx(narrow_deg)
+    monkeypatch.undo()
+    monkeypatch.setattr(smear, "MAX_PIECES", 6)
     just_drawn, too_long = (motion((0, 0, 0.999 * said_deg)), motion((0, 0, 1.002 * said_deg)))
     psf = GaussianPsf(SIGMA)
     assert len(smeared_sprites(star_on((160.2, 120.7), just_drawn), just_drawn, CAMERA, psf)) > 1

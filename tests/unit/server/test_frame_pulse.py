@@ -203,7 +203,7 @@ def test_a_line_that_is_lost_is_told_once_and_tried_until_it_is_back(kept):
     summary = pulse.summary()
     assert summary.lost == 1 and summary.skipped >= 10 and summary.pulses >= before + 1
     assert summary.pulses + summary.skipped == number  # the frame of the lost one is skipped, too
-    assert "lost 1 time" in summary.line()
+    assert "losses of the line: 1" in summary.line()
 
 
 def test_a_port_without_modem_lines_is_refused_in_a_line():

@@ -258,6 +258,7 @@ def test_a_good_display_passes_and_its_swaps_are_predicted_from_the_last_one(tmp
     screen, display = model_screen(tmp_path)
     timing = pass_gate(screen, force=False, clock=display.clock)
     assert timing.period_ms == pytest.approx(PERIOD_MS, rel=1e-6) and timing.paced_by_screen
+    assert screen.clock.measured_hz == pytest.approx(1e3 / PERIOD_MS)
     periods = (screen.clock.next_after(display.clock.ns) - display.flips_ns[-1]) / display.period_ns
     assert periods == pytest.approx(round(periods), abs=1e-4)
 

@@ -11,6 +11,7 @@ import shutil
 import threading
 import time
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -27,6 +28,7 @@ from hilstar.attitude.wire.packet import AttitudeSample, Refusal, encode
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notice, Notices
 from hilstar.cli.options import parse_split
+from hilstar.cli.running import optional_ledger
 from hilstar.server.record import ledger as ledger_module
 from hilstar.server.record.ledger import (
     MAX_WAITING_BYTES,
@@ -48,6 +50,7 @@ from hilstar.server.record.ledger_records import (
 )
 from hilstar.server.record.run_figures import RunFigures, figures_of, summarise
 from tests.support.full_disk import files_of_at_most
+from tests.support.ledgers import read_events
 from tests.support.refusals import refusal
 from tests.support.waiting import wait_for
 
@@ -423,6 +426,15 @@ def test_a_disk_that_takes_nothing_is_told_by_the_frames_and_its_return_by_the_w
             assert "ledger-stalled" in notices.active
         wait_for(lambda: "ledger-stalled" not in notices.active)
     assert told.count("ledger-stalled") == told.count("ledger-back") == 1
+
+
+def test_what_is_shown_by_force_is_an_event_of_its_ledger(tmp_path, small_bench):
+    path = tmp_path / "run.mcap"
+    forced = replace(small_bench, output={"forced": ["it is scaled"]})
+    with optional_ledger(path, forced, Notices(), overwrite=False, split=SplitLimits()):
+        pass
+    (event,) = read_events(path)
+    assert (event.kind, event.detail) == ("forced", "it is scaled: shown anyway (--force)")
 
 
 @pytest.mark.parametrize(("ended_by", "waited_s"), [(None, "0.2"), ("SIGTERM", "0.1")])

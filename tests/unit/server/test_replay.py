@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hilstar.attitude.clock.resolution import COARSE
 from hilstar.attitude.wire.packet import AttitudeSample, encode
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
@@ -181,6 +182,16 @@ def test_a_wrong_sky_of_the_run_is_wrong_again_in_the_frames_that_had_it():
 def test_a_replay_of_no_or_too_many_frames_is_refused(roll_log, config, wanted, word):
     with pytest.raises(InputError, match=word):
         plan_play(roll_log, wanted, config)
+
+
+def test_a_log_of_three_decimals_is_told_to_be_one_before_it_begins(tmp_path, config):
+    angle = 0.37 + 0.02 * np.arange(30)
+    q = np.stack([0.6 * np.cos(angle), 0.8 * np.cos(angle), *np.sin(angle) * [[0.28], [0.96]]])
+    lines = [f"{k / 10}," + ",".join(f"{part:.3f}" for part in row) for k, row in enumerate(q.T)]
+    path = tmp_path / "coarse.csv"
+    path.write_text("\n".join(["t_s,qw,qx,qy,qz", *lines]) + "\n")
+    told = dict(plan_play(path, Wanted(MAX), config).told)
+    assert told[COARSE].startswith("the quaternions come in steps of 0.001:")
 
 
 def test_a_log_that_turns_faster_than_the_bench_file_allows_is_refused_by_its_attitude(

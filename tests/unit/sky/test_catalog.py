@@ -197,5 +197,6 @@ def test_a_name_of_a_catalogue_s_own_leads_back_to_its_star(designation, name, i
     catalog = plain_catalog(designation, 1, columns)
     assert catalog.name(0) == name and catalog.identifier_of(name) == identifier
     assert [
-        catalog.identifier_of(other) for other in ("HIP 3", f"{designation} x", designation, "")
-    ] == [None] * 4
+        catalog.identifier_of(other)
+        for other in ("HIP 3", f"{designation} x", f"{designation} {'9' * 20}", designation, "")
+    ] == [None] * 5

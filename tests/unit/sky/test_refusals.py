@@ -116,10 +116,9 @@ ORBITS = [
             "2008-367T00:00:00",
         )
     ),
-    (ORBIT.replace(f"{EPOCH} ", "2008-09-20T13:00:00 ", 1), ":14: the epoch is not after the one"),
     (
-        oem(segment(range(0, 600, 60)), segment(range(600, 900, 60), CENTER_NAME=None)),
-        "CENTER_NAME missing",
+        ORBIT.replace("T12:31:00.000", "T12:30:00.000", 1),
+        "the epoch is not after the one before it",
     ),
     (ORBIT.replace(EPOCH, "2008-09-20T00:60:00", 1), "the epoch is"),
     (ORBIT.replace(EPOCH, "2008-09-20T00:00:60", 1), "the epoch is"),
@@ -135,6 +134,12 @@ def test_what_is_no_orbit_is_refused(text, words):
     changed = [number for number, (was, now) in enumerate(rows, start=1) if was != now]
     assert line.startswith(f"a.oem:{changed[0]}: ")
     assert words in line
+
+
+def test_a_segment_of_an_orbit_has_nothing_of_the_one_before():
+    text = oem(segment(range(0, 600, 60)), segment(range(600, 900, 60), CENTER_NAME=None))
+    line = refusal(OemOrbit, text, "a.oem", START_NS)
+    assert line.startswith("a.oem: REF_FRAME is EME2000 and CENTER_NAME missing")
 
 
 def table_file(*columns: fits.Column) -> bytes:

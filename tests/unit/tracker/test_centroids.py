@@ -12,6 +12,7 @@ from hilstar.tracker.centroids import (
     estimate_background,
     find_stars,
     noisiest_background,
+    s_curves,
     squares,
     star_widths,
 )
@@ -260,3 +261,18 @@ def test_a_square_is_about_the_nearest_pixel_and_dark_beyond_each_edge():
     assert values[2].tolist() == [[34.0, 35.0, 0.0], [44.0, 45.0, 0.0], [0.0, 0.0, 0.0]]
     assert dx_px[0, 0] == pytest.approx([-0.6, 0.4, 1.4])
     assert dy_px[0, :, 0] == pytest.approx([-0.6, 0.4, 1.4])
+
+
+def test_each_axis_has_the_s_curve_of_its_own_sigma():
+    """Those of a star that is turned by a quarter are exchanged; a narrow one has the larger bias.
+    A window that is too narrow for one axis alone is refused.
+    """
+    x, y = s_curves(CentroidSettings(psf_sigma_px=(0.5, 0.9)))
+    turned_x, turned_y = s_curves(CentroidSettings(psf_sigma_px=(0.9, 0.5)))
+    assert turned_y.measured_px == pytest.approx(x.measured_px, abs=1e-9)
+    assert turned_x.bias_px == pytest.approx(y.bias_px, abs=1e-9)
+    assert np.abs(x.bias_px).max() > 10 * np.abs(y.bias_px).max()
+    for sigma_px in ((0.3, 1.0), (1.0, 0.3)):
+        narrow = CentroidSettings(window_sigma_px=0.5, psf_sigma_px=sigma_px)
+        assert "window_sigma_px = 0.5 is too narrow for" in refusal(s_curves, narrow)
+    s_curves(CentroidSettings(window_sigma_px=0.5, psf_sigma_px=(1.0, 1.0)))

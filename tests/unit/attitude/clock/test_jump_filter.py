@@ -7,6 +7,7 @@ import pytest
 
 from hilstar.attitude.clock.jumps import (
     BEHIND,
+    CLOCK,
     MAX_DOUBT_NS,
     MAX_FOUND_LATE_NS,
     TRUSTED_WAIT_NS,
@@ -160,12 +161,12 @@ def test_lateness_is_against_the_arrivals_whatever_exchanges_say():
     assert clock.late_ns(host_ns - late_ns, host_ns) == 0
 
 
-def known_clock_notices(late_ms: list[int]) -> Notices:
-    """What is told of a sender that has this machine's clock, and sends each 50 ms from 1 s on."""
+def known_clock_notices(late_ms: list[int], step_ms: int = 50) -> Notices:
+    """What is told of a sender that has this machine's clock, and sends each `step_ms` from 1 s on."""
     notices = Notices()
     known = KnownClockFilter(notices, SenderClock(UnixOffset(0, 0), "shared"))
     for k, late in enumerate(late_ms):
-        host_ns = NS_PER_S + 50 * k * NS_PER_MS
+        host_ns = NS_PER_S + step_ms * k * NS_PER_MS
         known.take(Arrival(host_ns, AttitudeSample(host_ns - late * NS_PER_MS, Q, None, k)))
     return notices
 
@@ -174,6 +175,13 @@ def test_a_clock_ahead_is_a_wrong_sky_from_its_first_packet_on():
     """It is told 0.3 s later."""
     (condition,) = known_clock_notices([0] * 10 + [-100] * 10).wrong_sky.now()
     assert condition.since_ns == 3 * NS_PER_S // 2
+
+
+@pytest.mark.parametrize(("count", "is_told"), [(2, False), (3, True)])
+def test_three_packets_that_are_off_a_known_clock_are_told_however_seldom_they_come(count, is_told):
+    """Two seconds late, one each second."""
+    notices = known_clock_notices([0, 0, *[2000] * count], step_ms=1000)
+    assert (CLOCK in notices.lasting) == is_told
 
 
 def test_of_packets_by_a_known_clock_the_quickest_of_some_seconds_is_told():

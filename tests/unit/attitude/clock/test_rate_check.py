@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -153,6 +154,9 @@ def test_what_is_wrong_is_named_once_within_a_second(wrong, noisy):
     _, told, first_s = watched(samples(t_ns, q, change(q, rates)))
     assert [kind for kind, _ in told] == [WRONG]
     assert words in told[0][1] or (noisy and OTHER_AXES in told[0][1] and wrong in AXES)
+    for rad_s, deg_s in re.findall(r"the rates say (\S+) rad/s \((\S+) deg/s\)", told[0][1]):
+        # each is told to three digits
+        assert math.degrees(float(rad_s)) == pytest.approx(float(deg_s), rel=0.01)
     assert first_s < (1.3 if noisy and wrong.startswith("another") else 1.0) * TOLD_WITHIN_S
 
 

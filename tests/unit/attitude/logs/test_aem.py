@@ -19,6 +19,7 @@ from tests.support.sources.aem_messages import EPOCHS, kvn, read, rows_of, xml_o
 # Quaternions are written with 17 digits here; a matrix from one is a sum of four products, a few
 # roundings of 1.
 MATRIX_TOLERANCE = 1e-14
+SEVEN_DECIMALS = 6e-8  # half of the last of those that are shown, and a rounding
 # The reference derivative is a central difference over 2 h = 2e-4 s: h^2 rate^3 / 24 = 1e-9 1/s and
 # rounding 1e-16 / h.
 DIFFERENCE_S = 1e-4
@@ -127,6 +128,14 @@ def test_each_order_direction_and_frame_of_version_1_gives_the_same_attitude(
         camera_turn().inv().as_matrix(), abs=MATRIX_TOLERANCE
     )
     assert sample.rate_cam_rad_s is None
+    # and again in the file's own words, of which q and -q are one attitude
+    path = tmp_path / "again.aem"
+    path.write_text(text)
+    said = open_log(path).conventions.written(sample.q_icrs_to_cam)
+    names = {"FIRST": "QC Q1 Q2 Q3", "LAST": "Q1 Q2 Q3 QC"}[order]
+    assert said.startswith(f"{names} = (")
+    again = np.array(said.partition("(")[2].rstrip(")").split(", "), dtype=float)
+    assert again * np.sign(again @ row) == pytest.approx(row, abs=SEVEN_DECIMALS)
 
 
 @pytest.mark.parametrize("frame_a", ["ICRF", "SC_BODY_1"])

@@ -56,6 +56,7 @@ NO_EPOCHS = (
     "12.5",
 )
 LATE = "2262-04-11T23:47:16.854775808 0 0 0 1"
+TWO_BLOCKS = overlapping(([0, 10], {}), ([20, 30], {}))
 BLOCKS = [
     *((kvn([f"{epoch} 0 0 0 1"]), ":17: ") for epoch in NO_EPOCHS),
     (kvn([LATE]), "64 bits"),
@@ -126,6 +127,9 @@ KEYWORDS = [
 MESSAGES = [
     (good("VERS = 1.0", "VERS = 3.0"), "CCSDS_AEM_VERS is 3.0; write 1.0 or 2.0"),
     (good("DATA_STOP\n", ""), ":18: ...cut off"),
+    # after a block that is whole, in the second one's data and in its metadata
+    (TWO_BLOCKS.removesuffix("DATA_STOP\n"), "with 1 complete blocks of data; is it cut off?"),
+    (TWO_BLOCKS[: TWO_BLOCKS.rindex("META_STOP")], "ends in the metadata, with 1 complete"),
     (GOOD[: GOOD.index("META_STOP")], ":14: ...the file ends in the metadata"),
     ("CCSDS_AEM_VERS = 1.0\n", ":1: ...with 0 complete blocks"),
     (good("DATA_START\n", ""), ":16: ...in the gap before DATA_START"),

@@ -376,9 +376,11 @@ def test_columns_of_stars_that_mean_two_things_are_refused(csv_of, columns, cell
 
 
 def test_two_attitudes_at_one_time_of_a_row_a_star_are_refused(csv_of):
-    text = f"t_s,qw,qx,qy,qz,star_x,star_y\n0,{Q},1,2\n0,{OTHER},3,4\n"
-    with pytest.raises(InputError, match=":3: another attitude at t_s = 0; repeat the answer"):
-        read_telemetry(csv_of(text))
+    turned = f"{Q.rpartition(',')[0]},-0.0362700"  # the last component alone
+    for other in (OTHER, turned):
+        text = f"t_s,qw,qx,qy,qz,star_x,star_y\n0,{Q},1,2\n0,{other},3,4\n"
+        with pytest.raises(InputError, match=":3: another attitude at t_s = 0; repeat the answer"):
+            read_telemetry(csv_of(text))
 
 
 @pytest.mark.parametrize("t_s", ["9.1e9", "-9.1e9", "noon"])

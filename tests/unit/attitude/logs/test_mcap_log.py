@@ -91,12 +91,8 @@ def test_the_schema_names_every_field_with_one_plain_type():
 
 def test_a_message_keeps_the_packet_as_it_came():
     packet = encode(upright_sample(7))
-    assert (
-        bytes.fromhex(
-            json.loads(attitude_message(upright_sample(7), receive_ns=9, raw=packet))["raw"]
-        )
-        == packet
-    )
+    accepted = json.loads(attitude_message(upright_sample(7), receive_ns=9, raw=packet))
+    assert (bytes.fromhex(accepted["raw"]), accepted["receive_ns"]) == (packet, 9)
     refused = json.loads(refused_message("crc", "the CRC-32 does not fit", 9, b"\x00\xff"))
     assert (refused["accepted"], refused["reason"], refused["raw"]) == (
         False,

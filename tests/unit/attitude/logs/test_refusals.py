@@ -289,6 +289,7 @@ STK = [
     (stk("2 0 0 0 1", "1 0 0 0 1"), ":11: time does not increase"),
     (stk("END Attitude", "END Attitude\nmore"), ":13: 'more' after END Attitude"),
     (stk(f"{COUNT} 3", f"{COUNT} many"), f":4: {COUNT} is no count"),
+    (stk(f"{COUNT} 3", f"{COUNT} 0"), f":4: {COUNT} is no count"),
     (UNDATED_FIXED, "states no ScenarioEpoch; write it as 1 Jan 2025"),
     (MARS_FIXED, ":7: CoordinateAxes fixed of CentralBody Mars are not read; write J2000"),
     (stk_matrix(f"{THIRD} {THIRD} {THIRD}"), NO_MATRIX),

@@ -67,6 +67,21 @@ def test_a_body_that_turns_by_agis_example_turns_as_its_rates_say(stk_log):
     assert not spun.joins().misfits
 
 
+def test_angular_velocities_are_in_the_body_s_own_components(stk_log):
+    """Of a body that stands askew, about an axis that is none of its own."""
+    rate_deg_s = np.array([1.0, -2.0, 3.0])
+    askew = Rotation.from_rotvec([0.7, 1.1, -0.4])
+    rows = []
+    for t_s in (0.0, 0.5, 1.0):
+        to_body = Rotation.from_rotvec(-np.radians(rate_deg_s) * t_s) * askew
+        numbers = (*to_body.inv().as_quat().tolist(), *rate_deg_s.tolist())
+        rows.append(" ".join(map(repr, (t_s, *numbers))))
+    spun = stk_log(rows, "AttitudeTimeQuatAngVels")
+    for sample in spun.samples:
+        assert sample.rate_cam_rad_s == pytest.approx(np.radians(rate_deg_s), abs=ROUNDING)
+    assert not spun.joins().misfits
+
+
 def test_euler_angles_are_turns_of_the_axes_in_the_order_of_the_sequence(stk_log):
     angles = [10.0, 20.0, 30.0]
     for sequence, axes in (("321", "ZYX"), ("313", "ZXZ"), ("123", "XYZ")):

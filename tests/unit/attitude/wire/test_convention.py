@@ -5,6 +5,7 @@ the authority.
 from __future__ import annotations
 
 import os
+import re
 import socket
 from itertools import product
 
@@ -16,7 +17,14 @@ from cobs import cobs
 from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.wire import packet as wire
-from hilstar.attitude.wire.source import AS_SENT, HILSTARS, Convention, Mounting, SentAttitudes
+from hilstar.attitude.wire.source import (
+    AS_SENT,
+    HILSTARS,
+    Convention,
+    Mounting,
+    SentAttitudes,
+    packet_conventions,
+)
 from hilstar.server.bench.config.bench_config import parse_config
 from hilstar.server.open_link import open_link
 from tests.support.benches import SMALL_BENCH
@@ -53,6 +61,20 @@ def assert_is_truth(event: wire.Event) -> None:
     found = Rotation.from_quat(event.q_icrs_to_cam, scalar_first=True)
     assert (found * ICRS_TO_CAM.inv()).magnitude() < ROUNDING
     assert event.rate_cam_rad_s == pytest.approx(RATE, abs=RATE_ROUNDING)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_the_words_of_a_convention_name_its_components_where_they_stand(convention: Convention):
+    said = packet_conventions(convention)
+    order = re.search(r"\((.+)\)", said.scalar)[1].split(", ")
+    assert order.index("w") == {"first": 0, "last": 3}[convention.scalar]
+    sent = dict(zip(order, convention.as_sent(np.array([0.5, 0.1, -0.7, 0.5])), strict=True))
+    assert sent["w"] == 0.5
+    sign = -1 if convention.direction == "cam_to_icrs" else 1
+    assert [sent[axis] for axis in "xyz"] == [sign * 0.1, sign * -0.7, sign * 0.5]
+    frame = {"cam": "camera", "body": "body"}[convention.frame]
+    first, second = ("ICRS", frame) if sign == 1 else (frame, "ICRS")
+    assert said.turns.endswith(f"turns {first} components into {second} components")
 
 
 def config_with(convention: Convention, table: str):

@@ -222,3 +222,9 @@ def test_json_is_named_as_json_on_a_line_that_takes_none() -> None:
     event = decode_frame(json.dumps({"t_ns": 1, "q": list(Q)}).encode() * 3)
     assert isinstance(event, Refusal)
     assert "COBS" in event.detail
+
+
+@pytest.mark.parametrize("before", [b"", b" \r\n"])
+def test_json_in_a_frame_is_told_where_it_is_taken(before):
+    event = decode_frame(cobs.encode(before + json.dumps({"t_ns": 1, "q": list(Q)}).encode()))
+    assert "send JSON over ZeroMQ or UDP" in event.detail

@@ -9,7 +9,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.attitude.wire.source import CHECK_RADEC_DEG, PACKETS, Conventions, Mounting, components
+from hilstar.attitude.wire.source import (
+    CHECK_RADEC_DEG,
+    PACKETS,
+    Convention,
+    Conventions,
+    Mounting,
+    components,
+    packet_conventions,
+)
 from hilstar.basics.rotation import to_radec_roll_deg
 
 # Three products of float64 rotations.
@@ -62,3 +70,20 @@ def test_the_self_check_points_where_it_says(conventions: Conventions) -> None:
     q = np.array([float(number) for number in match[1].split(",")])
     cam = mounting.sample(AttitudeSample(0, q)).q_icrs_to_cam if conventions.of_body else q
     assert to_radec_roll_deg(cam)[:2] == pytest.approx(CHECK_RADEC_DEG, abs=DIGITS_DEG)
+
+
+@pytest.mark.parametrize(
+    ("stated", "turns", "order"),
+    [
+        ({}, "q_icrs_to_cam turns ICRS components into camera components", "first (w, x, y, z)"),
+        (
+            {"direction": "cam_to_icrs", "frame": "body", "scalar": "last"},
+            "q_body_to_icrs turns body components into ICRS components",
+            "last (x, y, z, w)",
+        ),
+    ],
+)
+def test_a_convention_is_said_as_what_turns_into_what(stated, turns, order) -> None:
+    found = packet_conventions(Convention(**stated))
+    assert (found.turns, found.of_body) == (turns, bool(stated))
+    assert found.scalar == f"scalar {order}, Hamilton"

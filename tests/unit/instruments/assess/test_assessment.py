@@ -339,6 +339,18 @@ def test_gaps_invalid_and_wrong_answers_are_outages_and_longer_ones_lose_the_loc
     assert lock.acquisition_probability == 1.0
 
 
+def test_an_outage_of_up_to_three_cycles_keeps_the_lock() -> None:
+    """Its length, which is a cycle less than the gap: 2.5 and 4 cycles."""
+    t_s = np.arange(0.0, 20.0, 0.1)
+    t_s[100:] += 0.05
+    right = np.ones(len(t_s), dtype=bool)
+    right[98:100] = right[150:154] = False
+    commanded = Commanded(t_s, np.tile([1.0, 0.0, 0.0, 0.0], (len(t_s), 1)))
+    lock = lock_of(commanded, t_s, right, np.zeros(len(t_s), dtype=bool))
+    assert [outage.length_s for outage in lock.outages] == pytest.approx([0.25, 0.4])
+    assert [outage.lost for outage in lock.outages] == [False, True]
+
+
 def test_a_sky_that_went_before_the_telemetry_or_came_after_it_was_not_to_be_acquired() -> None:
     """Shown from 0, 20, 40 and 60 s for ten seconds each; answers from 25 to 55 s. What is lost from
     27 s on comes between the second sky and the third.

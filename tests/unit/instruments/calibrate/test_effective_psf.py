@@ -30,6 +30,7 @@ from hilstar.instruments.calibrate.effective_psf import (
     _of_frames,
     _placed,
     _Places,
+    _rms,
     _spline,
     _Sums,
     _variance,
@@ -351,6 +352,7 @@ def test_errors_of_dots_that_are_held_out_are_beside_their_brightest_pixels():
     np.testing.assert_allclose(held.chi2, (off**2).mean(axis=(1, 2)) / 9, rtol=0.02)
     rms = np.sqrt(np.mean((off**2).mean(axis=(1, 2)) / brightest**2))
     assert held.rms == pytest.approx(rms, rel=0.01)
+    assert _rms(np.array([1.0, -7.0, 0.0])) == pytest.approx(np.sqrt(50 / 3))
     assert held.noise == pytest.approx(3 * np.sqrt(np.mean(brightest**-2.0)), rel=0.01)
 
 

@@ -585,6 +585,13 @@ def test_a_session_file_that_is_none_is_refused(counted, tmp_path, data):
     assert "is no session" in refusal(counted.go, tmp_path)
 
 
+def test_a_session_file_of_another_kind_is_refused(counted, tmp_path):
+    counted.go(tmp_path)
+    path = tmp_path / "s" / "session.json"
+    path.write_text(path.read_text().replace('"kind": "', '"kind": "another '))
+    assert "kind = 'another " in refusal(counted.go, tmp_path)
+
+
 def test_a_key_that_cannot_be_set_leaves_the_file_alone(tmp_path):
     path = tmp_path / "bench.toml"
     path.write_text(bench_text({"monitor": {"flip_x": None}}).replace("[monitor]", "[ monitor ]"))

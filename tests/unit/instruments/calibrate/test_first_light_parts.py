@@ -31,6 +31,7 @@ from hilstar.instruments.calibrate.first_light.seen_stars import (
     _explained,
     _is_in_image,
     _is_inside,
+    _why_few,
 )
 from hilstar.instruments.calibrate.first_light.stars import (
     LOST_SHARE,
@@ -112,6 +113,21 @@ def test_shapes_without_a_share_explain_nothing_on_the_mean(rng):
     assert _explained(3 + 2 * x, x) == pytest.approx(1.0)
     assert _explained(np.ones(12), x) == 0.0
     assert _explained(np.array([1.0, 2.0]), np.array([1.0, 2.0])) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("lost", "sigma_px", "why"),
+    [
+        (0, (0.9, 1.4), "; the field has few bright stars: write a longer"),
+        (0, (3.0, 12.0), "; a star's sigma is 6.0 px: write a longer"),
+        (4, (3.0, 12.0), "; 4 that should be bright enough are not there: measure the response"),
+    ],
+)
+def test_why_few_stars_are_seen_is_said_by_what_is_wrong(lost, sigma_px, why):
+    seen = stars_seen(residual_px=np.zeros((3, 2)), lost=lost)
+    line = _why_few(seen, replace(SPOT, sigma_px=sigma_px), 2)
+    assert line.startswith("3 stars can be seen where the sky has them, in 2 fields, and 5 are")
+    assert why in line
 
 
 def window_sums(place_px: tuple[float, float], spot: StarSpot) -> tuple[np.ndarray, np.ndarray]:

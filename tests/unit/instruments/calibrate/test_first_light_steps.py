@@ -473,6 +473,9 @@ def test_stars_that_stand_where_the_sky_has_them_pass_and_dim_ones_do_not(tmp_pa
     assert failed.verdict == "failed"
     assert "measure what white is worth" in failed.line
     assert failed.figures["flux_zero_point_mag"] == pytest.approx(-2.5 * math.log10(0.9), abs=0.02)
+    # what they have in common is no scatter
+    for name in ("flux_rms_mag", "flux_p95_mag", "flux_max_mag"):
+        assert failed.figures[name] < 2 * passed.figures[name]
 
 
 def test_stars_beside_their_places_ask_for_the_geometry(tmp_path):

@@ -65,17 +65,17 @@ def test_a_response_is_recovered_to_one_percent_over_three_decades(name, black, 
     """3 repeats do where a formula fits; a shape of its own has twice the free parameters, and is
     measured 6 times.
 
-    Of 200 seeds, 96 to 100 % then meet the aim; ten are run here, of which one may miss it.
+    Of 200 seeds, 96 to 100 % then meet the aim; five are run here, of which one may miss it.
     """
     repeats = 3 if name in ("gamma", "srgb") else 6
     met = 0
-    for seed in range(10):
+    for seed in range(5):
         path = measure_plan(
             tmp_path / "m.csv", CURVES[name], np.random.default_rng(seed), bits, repeats, black
         )
         error = curve_errors(fit_channel(read_measurements(path), "w"), CURVES[name])
         met += np.abs(error).max() < WORST and np.sqrt((error**2).mean()) < RMS
-    assert met >= 9
+    assert met >= 4
 
 
 def test_even_steps_of_code_do_where_the_light_is_a_power_law(tmp_path):

@@ -205,7 +205,7 @@ def test_a_planted_fault_is_found_by_its_clause(
 def test_a_healthy_tracker_is_not_accused(tmp_path: Path, of: str) -> None:
     (tmp_path / "dark.toml").write_text(SCENARIO)
     keys = [key for key, fault in FAULTS.items() if fault[0] == of]
-    text = SETS[of]
+    text = SETS[of].replace("cases = 60", "cases = 30")  # nothing has to be shown but its absence
     for key in keys:
         _, _, size, side = FAULTS[key]
         text += clause_text(key, size * (0.6 if side == "minimum" else 1.0), of, side)

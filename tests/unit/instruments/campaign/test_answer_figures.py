@@ -44,8 +44,8 @@ from tests.support.planted_answers import (
 # found within 10 %, or within three standard errors where those are larger
 SHARE, SIGMAS = 0.1, 3.0
 COVERED, TRIES = 0.95, 200
-# binomial: of 200 intervals at 95 % each way, 180 and fewer hold once in 1000
-MIN_HELD = 180
+# binomial: of 100 intervals at 95 % each way, 87 and fewer hold once in 680
+INTERVALS, MIN_HELD = 100, 88
 # binomial: of 1000 intervals at 95 %, 927 and fewer hold once in 1000
 HEAVY_TRIES, MIN_HEAVY_HELD = 1000, 928
 SQUARE_TRIES = 400
@@ -167,11 +167,37 @@ def test_a_late_stamp_and_a_slow_gyroscope_are_found_in_seconds(
     assert lagging.value == pytest.approx(0.3, rel=0.05)
 
 
+def test_a_case_without_an_attitude_tells_nothing_of_the_aberration(
+    rng: np.random.Generator,
+) -> None:
+    cases = answers(rng, aberration=1.0)
+    numbers = {name: values.copy() for name, values in cases.numbers.items()}
+    numbers["qw"][:3] = np.nan
+    whole = figure_verdict(cases, "aberration", maximum=2.0)
+    some = dataclasses.replace(cases, numbers=numbers)
+    fewer = figure_verdict(some, "aberration", maximum=2.0)
+    assert fewer.cases == whole.cases - 3
+    assert fewer.value == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_lag_is_told_about_an_axis_about_which_cases_accelerate(
+    rng: np.random.Generator,
+) -> None:
+    cases = answers(rng, rate_lag=0.3)
+    still = np.zeros_like(cases.numbers["vary.acceleration_deg_s2.x"])
+    numbers = cases.numbers | {"vary.acceleration_deg_s2.x": still}
+    cases = dataclasses.replace(cases, numbers=numbers)
+    words = figure_verdict(cases, "rate-lag", maximum=0.5, axis="x").words
+    assert "no case accelerates about that axis" in words
+    about_y = figure_verdict(cases, "rate-lag", maximum=0.5, axis="y")
+    assert about_y.value == pytest.approx(0.3, rel=0.05)
+
+
 @pytest.mark.parametrize("quantity", ["rate-bias", "rate-scale", "time-bias", "aberration"])
 def test_limits_hold_at_their_confidence(quantity: str, rng: np.random.Generator) -> None:
     make, keys, size = PLANTED[quantity]
     above = below = 0
-    for _ in range(TRIES):
+    for _ in range(INTERVALS):
         found = figure_verdict(
             make(rng, 40, **keys(size)), quantity, maximum=size, axis=_axis(quantity)
         )

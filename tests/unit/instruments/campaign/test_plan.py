@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,20 @@ import pytest
 
 from hilstar.basics.rotation import to_matrix
 from hilstar.instruments.campaign.cases import CaseMaker
-from hilstar.instruments.campaign.plan import Design, Parameter, Plan, parse_plan, read_plan
+from hilstar.instruments.campaign.plan import (
+    Design,
+    Parameter,
+    Plan,
+    Require,
+    changed_bench,
+    check_require,
+    checked_conditions,
+    parse_plan,
+    read_plan,
+)
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.campaigns import plan_text, write_campaign
+from tests.support.refusals import refusal
 
 PSF: dict[str, Any] = {"key": "tracker.psf_sigma_px", "minimum": 0.5, "maximum": 1.0}
 
@@ -68,6 +80,48 @@ def test_a_key_by_its_logarithm_stays_within_its_ends(rng: np.random.Generator) 
         parameter = Parameter("key", (), low, low * ratio, log=True)
         assert low <= parameter.value(0.0) <= low * (1 + 1e-12)
         assert low * ratio * (1 - 1e-12) <= parameter.value(1.0) <= low * ratio
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({"quantity": "bias", "maximum": 1.5}, "bias cross at most 1.5 arcsec"),
+        ({"quantity": "availability", "minimum": 0.0}, "availability at least 0"),
+        (
+            {"quantity": "recovery", "maximum": 4, "share": 0.9, "condition": "time_s > 2"},
+            "recovery at most 4 s in 90 % of cases where time_s > 2",
+        ),
+    ],
+)
+def test_a_requirement_is_named_by_its_figures(keys: dict[str, Any], words: str) -> None:
+    require = msgspec.convert(keys, Require)
+    check_require("[[require]]", require)
+    assert require.words == words
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('rate == "fast"', "rate is no key that the plan varies (rate), and no column of texts"),
+        ("why <= 3", "and no column of numbers"),
+        ("speed <= 3", "speed is no key"),
+    ],
+)
+def test_a_condition_compares_what_is_there_with_its_kind(text: str, words: str) -> None:
+    columns = {"why": "text", "stars": "number", "vary.rate": "number"}
+    for fitting in ("rate <= 3 and stars > 2", 'why == ""'):
+        assert checked_conditions(fitting, columns)
+    assert words in refusal(checked_conditions, text, columns)
+
+
+def test_one_number_for_a_pair_is_for_both(tmp_path: Path) -> None:
+    write_campaign(tmp_path)
+    file = read_bench_file(tmp_path / "bench.toml")
+    tables = tomllib.loads(file.text)
+    for key, pair in (("tracker.psf_sigma_px", (0.7, 0.7)), ("tracker.psf_sigma_px.1", (0.6, 0.7))):
+        before = file.config.tracker.psf_sigma_px
+        changed = changed_bench(file, tables, {key: 0.7}).config.tracker.psf_sigma_px
+        assert changed == (pair if key.endswith("px") else (before[0], 0.7))
 
 
 def test_values_are_those_of_the_plan_and_reach_the_bench(tmp_path: Path) -> None:

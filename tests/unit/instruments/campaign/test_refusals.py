@@ -49,6 +49,11 @@ BY_THE_COMMAND = {
         {},
         ["fast"],
     ),
+    "rate of a switch": (
+        {"key": "rate_deg_s.x", "minimum": None, "maximum": None, "values": [True]},
+        {},
+        ["the value True; write a number from"],
+    ),
     "display's key, no display": (
         {"key": "monitor.refresh_hz", "minimum": 50, "maximum": 60},
         {},
@@ -87,6 +92,7 @@ PLANS = [
     (looking(kind="field"), "radec_deg"),
     (looking(kind="log"), "log"),
     (looking(radec_deg=[1, 2]), "field"),
+    (looking(kind="all-sky", radec_deg=[1, 2]), 'radec_deg is for kind = "field"'),
     (plan_text(SUN[2], SUN[2] | {"key": "limb_deg"}), "are one angle"),
     (looking(*SUN, kind="body", body="moon"), "bench has none"),
     (looking(*SUN, kind="body"), "go together"),
@@ -109,6 +115,8 @@ JITTER = {"key": "jitter_arcsec.across", "values": [10.0]}
 HZ = {"key": "jitter_hz", "values": [10.0]}
 SLEW = {"key": "motion_s", "values": [2.0]}
 PLANS += [
+    (plan_text(answers=2), 'answers: is for through = "bench"; write that, or leave answers out'),
+    (plan_text(through="bench", frames=2), 'frames: is for through = "tracker" or "display";'),
     (plan_text(JITTER), "go together"),
     (plan_text(HZ), "go together"),
     (

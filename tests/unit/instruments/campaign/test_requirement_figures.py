@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from scipy import stats
@@ -29,6 +30,7 @@ from hilstar.instruments.campaign.requirements import (
     NOT_SHOWN,
     RequirementVerdict,
     _bias,
+    _noise,
     verdicts_of,
 )
 from tests.support.assessments import a_budget
@@ -144,6 +146,15 @@ def test_a_sigma_s_limits_are_those_of_chi_square():
     low, high = sigma_limits(4.0, 10.0, 0.95)
     assert low == pytest.approx(math.sqrt(40 / 18.307), rel=1e-4)
     assert high == pytest.approx(math.sqrt(40 / 3.940), rel=1e-4)
+
+
+def test_a_noise_of_two_axes_has_the_freedom_of_both(rng):
+    require = msgspec.convert({"quantity": "noise", "maximum": 9.0}, Require)
+    left = rng.normal(0.0, 2.0, (60, 2))
+    figure = _noise(left, 58.0, require, rng)
+    assert figure.value == pytest.approx(math.sqrt((left**2).mean()))
+    limits = sigma_limits(float((left**2).mean()), 116.0, require.confidence)
+    assert (figure.low, figure.high) == pytest.approx(limits)
 
 
 def test_a_quantile_s_limits_are_order_statistics():

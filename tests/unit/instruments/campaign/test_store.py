@@ -14,6 +14,7 @@ import pytest
 
 from hilstar.basics.errors import InputError
 from hilstar.instruments.campaign import store
+from hilstar.instruments.campaign.run import Campaign
 from hilstar.instruments.campaign.store import (
     About,
     Directory,
@@ -23,7 +24,7 @@ from hilstar.instruments.campaign.store import (
     schema_of,
     write_table,
 )
-from tests.support.campaigns import read_columns
+from tests.support.campaigns import read_columns, write_campaign
 from tests.support.damage import NO_JSON
 from tests.support.refusals import refusal
 
@@ -104,6 +105,18 @@ def test_a_table_is_the_same_bytes_whatever_the_order_and_the_pauses(tmp_path: P
     assert not (tmp_path / "2").exists()
 
 
+def test_a_row_in_another_block_s_file_is_dropped(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "j", 16)
+    journal.append([row(3), row(9)])
+    journal.close()
+    first, second = (tmp_path / "j" / f"00000{block}.jsonl" for block in (0, 1))
+    first.write_bytes(first.read_bytes() + second.read_bytes())
+    second.unlink()
+    again = Journal(tmp_path / "j", 16)
+    assert again.done == 1 and 9 in again.missing(1)
+    again.close()
+
+
 def test_a_full_block_that_lost_rows_is_refused(tmp_path: Path) -> None:
     journal = Journal(tmp_path / "j", 3)
     journal.append([row(case) for case in range(3)])
@@ -167,6 +180,17 @@ def test_a_directory_of_another_campaign_is_refused_with_what_differs(
             directory.claim(now)
         else:
             assert refusal(directory.claim, now) == line
+
+
+def test_a_campaign_with_images_is_another_than_one_without(tmp_path: Path) -> None:
+    plan = write_campaign(tmp_path, {"key": "time_s", "values": [0.0]}, cases=2)
+    with contextlib.closing(Directory(tmp_path / "out")) as directory:
+        for images in (False, True):
+            about = Campaign(plan, directory.path, "centroids", 1.0, images).about()
+            if images:
+                assert "--images was another" in refusal(directory.claim, about)
+            else:
+                directory.claim(about)
 
 
 @pytest.mark.parametrize("name", ["cases.parquet", "journal"])

@@ -19,9 +19,9 @@ from hilstar.instruments.campaign.sweep import (
 )
 
 CASES = 16
-TRIES = 300
-# binomial: of 300 intervals at 95 % each way, 272 and fewer hold once in 1000
-MIN_HELD = 273
+TRIES = 150
+# binomial: of 150 intervals at 95 % each way, 133 and fewer hold once in 690
+MIN_HELD = 134
 
 
 def swept(

@@ -63,7 +63,7 @@ from tests.support.planted_tracker import plant as plant_tracker
 
 BENCHES = 16
 FAR = 3 * math.sqrt(0.05 * 0.95 / BENCHES)  # the figures of one bench's third go nearly together
-UNCHANGED = 20
+UNCHANGED = 10
 FEW = 6
 # of figures that go together in each of FEW benches
 MIN_HELD = 0.95 - 3 * math.sqrt(0.05 * 0.95 / FEW)

@@ -26,6 +26,7 @@ resolution_px = [256, 200]
 quantum_efficiency = "ccd47-20"
 [tracker.detector]
 read_noise_e = 5
+gain_e_per_dn = 2.5
 [sky]
 epoch_jyear = 2026.0
 [monitor]
@@ -103,6 +104,17 @@ def test_dots_are_seen_where_the_geometry_has_them_with_light_alike(reader: Imag
     at_x_px, at_y_px = geometry.to_tracker(x_px.astype(float), y_px.astype(float))
     assert 0 < at_x_px.min() < 30 < width - 30 < at_x_px.max() < width - 1
     assert 0 < at_y_px.min() < 30 < height - 30 < at_y_px.max() < height - 1
+
+
+def test_dots_that_the_image_s_edge_cuts_are_left_out(reader: ImageReader) -> None:
+    geometry = geometry_of(reader.file)
+    x_px, y_px = dot_places(geometry)
+    beside = geometry.to_monitor(np.full(4, 0.3), np.linspace(40.0, 160.0, 4))
+    edge_x_px, edge_y_px = (np.rint(place).astype(np.intp) for place in beside)
+    assert not np.isin(edge_x_px, x_px).any()
+    read = reader.dots(np.append(x_px, edge_x_px), np.append(y_px, edge_y_px), 1)
+    assert len(read.x_px) > 0.9 * len(x_px)
+    assert not np.isin(edge_x_px, read.x_px).any()
 
 
 def test_a_photodiode_sees_the_true_delay(reader: ImageReader) -> None:

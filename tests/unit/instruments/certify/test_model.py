@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
+from msgspec import structs
 
 from hilstar.basics.rotation import from_rotation_vector, to_matrix
 from hilstar.basics.units import ARCSEC_PER_RAD
-from hilstar.instruments.certify.model import Deviations, Figures, thirds, usable_stars
+from hilstar.instruments.certify.model import (
+    Deviations,
+    Figures,
+    thirds,
+    true_deviations,
+    usable_stars,
+)
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.optics.camera import Camera
 from tests.support.planted_certify import reference_star, stated_bench
@@ -90,3 +99,14 @@ def test_stars_on_one_line_tell_a_turn_and_no_mirror(turn_arcsec):
     for axis, arcsec in zip("xyz", turn_arcsec, strict=True):
         number = figures.names.index((f"attitude_{axis}", -1, "arcsec"))
         assert found[number] == pytest.approx(arcsec, abs=1e-4)
+
+
+def test_a_true_delay_is_that_of_the_truth_s_panel():
+    file = stated_bench("[certify]\nrate_deg_s = 1.0\n")
+    monitor = structs.replace(file.config.monitor, panel_delay_ms=12.5)
+    truth = dataclasses.replace(file, config=structs.replace(file.config, monitor=monitor))
+    figures = Figures(file, [reference_star(direction=np.array([0.0, 0.0, 1.0]))])
+    assert file.config.monitor.panel_delay_ms != 12.5
+    off = true_deviations(figures, truth)
+    assert (off.delay_ms.tolist(), off.late_ms.tolist()) == ([12.5], [0.0])
+    assert off.place_arcsec == pytest.approx(np.zeros((1, 1, 2)))

@@ -110,11 +110,10 @@ def test_an_unchanged_frame_is_the_same_sky(scene):
 PLACES = {
     "belt": (84.057, -1.2),
     "Sirius": (101.29, -16.7),
-    "Pleiades": (56.7, 24.1),
     "Milky Way": (266.0, -29.0),  # 680 faint stars in 320 x 240
 }
-DRAWN = [("default", "belt"), ("default", "Sirius"), ("default", "Pleiades")]
-DRAWN += [("faint stars", "belt"), ("faint stars", "Milky Way"), ("wide", "Milky Way")]
+DRAWN = [("default", "belt"), ("default", "Sirius")]
+DRAWN += [("faint stars", "Milky Way"), ("wide", "Milky Way")]
 
 
 @pytest.mark.parametrize(("sky", "place"), DRAWN)

@@ -19,6 +19,44 @@ from hilstar.instruments.verify.measure import DECENTRED, HIGHER, LENS, TILT, St
 from hilstar.instruments.verify.summary import _by_magnitude
 from hilstar.instruments.verify.verdict import DisplayErrors
 from hilstar.optics.layers.truth import TRUTH_DTYPE
+from hilstar.testing import compare
+from tests.support.refusals import refusal
+
+
+def sky_of(*stars: tuple[float, float, float]) -> np.ndarray:
+    """A linear image of Gaussian stars: the peak, x and y of each."""
+    y, x = np.mgrid[:48, :64]
+    return sum(
+        peak * np.exp(-((x - at_x) ** 2 + (y - at_y) ** 2) / 2) for peak, at_x, at_y in stars
+    )
+
+
+SKY = sky_of((100.0, 15.2, 20.3), (60.0, 45.1, 40.2), (30.0, 52.4, 10.7))
+
+
+def test_a_sky_is_the_same_within_the_limit_that_is_given_of_each():
+    """A star that is 0.1 mag brighter, and one that has moved by 0.1 px."""
+    brighter = sky_of((100 * 10**0.04, 15.2, 20.3), (60.0, 45.1, 40.2), (30.0, 52.4, 10.7))
+    moved = sky_of((100.0, 15.2, 20.3), (60.0, 45.2, 40.2), (30.0, 52.4, 10.7))
+    assert not compare(brighter, SKY, flux_mag=0.05, centroid_px=0.5).same
+    assert compare(brighter, SKY, flux_mag=0.2, centroid_px=0.05).same
+    assert not compare(moved, SKY, flux_mag=0.5, centroid_px=0.05).same
+    assert compare(moved, SKY, flux_mag=0.05, centroid_px=0.2).same
+
+
+@pytest.mark.parametrize(
+    ("frame", "golden", "words"),
+    [
+        (SKY[:, 1:], SKY, "63 x 48 px against 64 x 48 px"),
+        (np.where(SKY > 90, np.nan, SKY), SKY, "the frame image has a pixel that is NaN"),
+        (SKY, np.where(SKY > 90, np.inf, SKY), "the golden image has a pixel that is NaN"),
+        (SKY[0], SKY[0], "the frame image has the shape (64,)"),
+        (SKY[:1], SKY[:1], "the frame image has the shape (1, 64)"),
+        (SKY, np.zeros_like(SKY), "the golden image has no star"),
+    ],
+)
+def test_what_is_no_pair_of_skies_is_refused(frame, golden, words):
+    assert words in refusal(compare, frame, golden)
 
 
 @pytest.mark.parametrize("sigma_px", [0.3, 0.9, 2.0])

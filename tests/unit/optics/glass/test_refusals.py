@@ -63,7 +63,7 @@ ZEMAX = [
         r"line \d+: SCBD at surface 1 tilts or moves the surface",
     ),
     (
-        zmx_surface("XDAT 1 3.0 0 0 1 0 0"),
+        zmx_surface("XDAT 1 3.0 0 0 1 0 0", "XDAT 2 0.0 0 0 1 0 0"),
         r"line \d+: XDAT at surface 1 gives further coefficients",
     ),
     (zmx_surface("PARM 2 1e-5"), r"line \d+: PARM 2 of surface 1 \(STANDARD\) is not known"),

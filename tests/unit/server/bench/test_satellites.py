@@ -5,6 +5,7 @@ and what is said of them.
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from hilstar.sky.bodies.disc import Disc
 from hilstar.sky.bodies.passes import Cone
 from tests.support.benches import bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.refusals import refusal
 from tests.support.satellites import element_set, some_orbits
 from tests.support.skies import STATION_TLE, STATION_UTC
 from tests.support.stars import sprites_at
@@ -139,6 +141,15 @@ def test_each_frame_of_an_exposure_has_the_satellites_of_its_own_time(tle_bench,
     display.expose(View.exposure(q, np.zeros(3), 0.1, AT_S * S_NS), None)
     display.close()
     assert np.array(drawn) / S_NS * 120 == pytest.approx([-5, -3, -1, 1, 3, 5], abs=1e-6)
+
+
+@pytest.mark.parametrize(("name", "limit_mb"), [("tles.txt", 20), ("seen.csv", 5)])
+def test_a_list_of_satellites_and_a_table_of_them_have_their_limits(tle_bench, name, limit_mb):
+    path = tle_bench.with_name(name)
+    os.truncate(path, limit_mb * 10**6 + 1)
+    file = read_bench_file(tle_bench)
+    line = refusal(bench_moving, file.config, file.folder)
+    assert line.startswith(f"{path}: ") and f"and at most {limit_mb} MB are read" in line
 
 
 def fast_moment(bench: Bench) -> int:

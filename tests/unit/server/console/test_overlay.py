@@ -97,6 +97,8 @@ def test_a_grid_s_labels_have_as_many_digits_as_its_step(f_mm, digits):
 @pytest.mark.parametrize("dec_deg", [-87.0, 87.0])
 def test_a_grid_with_a_pole_in_it_has_right_ascensions_all_around(overlay_bench, dec_deg):
     lines = overlay_of(overlay_bench).truth(0, from_radec_roll_deg(40.0, dec_deg, 0.0)).grid
+    every = "".join(line.label for line in lines)
+    assert ("\N{MINUS SIGN}" in every) == (dec_deg < 0) and "-" not in every
     labels = {line.label for line in lines if line.label.startswith("RA")}
     assert labels == {f"RA {ra}\N{DEGREE SIGN}" for ra in range(0, 360, 30)}
 

@@ -249,6 +249,15 @@ def event(k: int, kind: str, since: int | None = None) -> EventRecord:
     )
 
 
+def test_an_event_has_the_time_of_day_of_its_own_moment():
+    """The head's two clocks are of 3 s before the first swap; the event came 0.1 s after that."""
+    head = {"unix_ns": str(1_800_000_000 * 10**9), "monotonic_ns": str(10**12 - 3 * 10**9)}
+    figures = RunFigures(head)
+    figures.add(frame_record(0), event(6, "mark"))
+    (told,) = run_data("run.mcap", figures, summarise(figures))["events"]
+    assert (told["t_s"], told["utc"]) == (0.1, "2027-01-15T08:00:03.100+00:00")
+
+
 @pytest.mark.parametrize("block", [1, 7, 1000])
 def test_frames_of_a_wrong_sky_are_wrong_from_when_it_began(block):
     """It is found at frame 50, and began at 20; the frames between are in blocks before it."""

@@ -120,6 +120,12 @@ def test_air_dims_what_is_behind_it_as_traced_rays_say(rng):
     assert np.abs(shining - light[beside]).max() < AIR_LIMIT and shining.max() > 0.3
     assert np.abs(found - through)[(through > 0) & (found > 0)].max() < AIR_LIMIT
     assert np.count_nonzero((found > 0.05) & (found < 0.9)) > 20  # the shell is among the rays
+    # disc and air together: the traced rays' own light, down to where the air is dense
+    both, covered = one.with_air(rays)
+    assert covered == pytest.approx(1 - found)
+    assert np.abs(both - light)[beside].max() < AIR_LIMIT
+    assert np.count_nonzero(beside & (covered > 0.5)) > 5
+    assert both[~beside] == pytest.approx(one.radiance(rays[~beside]))
 
 
 @pytest.mark.parametrize("polar", [0.7, 0.9, 1.0, 1.1])

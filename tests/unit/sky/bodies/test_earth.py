@@ -51,6 +51,8 @@ def test_each_ray_of_the_limb_is_where_its_own_light_time_and_aberration_have_it
         ahead if speed_km_s < 8 else (ahead + 0.4 * towards) / np.hypot(1, 0.4)
     )
     disc = earth_disc(seen_km, SUN_KM, velocity, 1.0)
+    # WGS 84
+    assert (disc.equator_km, disc.polar_km) == pytest.approx((6378.137, 6356.752), abs=1e-3)
     body = Body(seen_km, disc.equator_km, disc.polar_km, disc.pole, disc.sun, lambert)
     rays = limb(body, 36)
     # Where each ray touches: the point nearest to the centre, in the spheroid's axes

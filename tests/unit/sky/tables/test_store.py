@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hilstar.sky import star_table
 from hilstar.sky.catalog import column_names
-from hilstar.sky.star_table import KEPT_FILES, TableChoice, choose_catalog, kept
+from hilstar.sky.star_table import KEPT_FILES, TableChoice, choose_catalog, kept, store_path
 from tests.support.waiting import PATIENCE_S
 
 TEXT = "ra_deg,dec_deg,vmag,b-v\n1,2,3,0.1\n4,5,6,\n7,8,9,0.5\n"
@@ -66,6 +67,20 @@ def test_another_content_epoch_or_company_is_another_catalogue(stored_table):
     os.utime(stored_table, ns=(before.st_atime_ns, before.st_mtime_ns + 1))
     assert 0.7 in choose_catalog(TableChoice(stored_table)).bv_mag
     assert len(stored(stored_table)) == 4
+
+
+def test_a_cache_lies_in_the_user_s_directory_by_what_it_was_made_of(tmp_path, monkeypatch):
+    """The XDG base directory specification: a path that is not absolute is ignored."""
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    in_home = tmp_path / "home" / ".cache" / "hilstar"
+    for named, folder in ((str(tmp_path), tmp_path / "hilstar"), ("near", in_home), ("", in_home)):
+        monkeypatch.setenv("XDG_CACHE_HOME", named)
+        assert store_path(["a"]).parent == folder
+    before = store_path(["a", "b"])
+    assert store_path(["a", "b"]) == before
+    assert store_path(["a", "c"]) != before != store_path(["ab"])
+    monkeypatch.setattr(star_table, "VERSION", star_table.VERSION + 1)
+    assert store_path(["a", "b"]) != before
 
 
 def test_a_damaged_or_hostile_cache_is_made_anew(stored_table):

@@ -256,6 +256,13 @@ def test_a_kernel_of_one_byte_over_its_limit_is_refused_before_spice_reads_it(
     assert line.startswith(f"{kernel}: ") and f"and at most {said} are read" in line
 
 
+def test_a_ck_of_one_byte_over_its_limit_is_refused_before_spice_reads_it(tmp_path, raw):
+    path = tmp_path / "whole.bc"
+    os.truncate(path, 500 * 10**6 + 1)
+    line = ck_refusal(path)
+    assert line.startswith(f"{path}: ") and "and at most 500 MB are read" in line
+
+
 def test_a_structure_that_is_not_there_is_refused_with_those_that_are(tmp_path, raw):
     for stated in ("-7", "NOBODY", "MARS"):
         assert f"contains no structure {stated!r}; it has -82000: --body ID" in ck_refusal(

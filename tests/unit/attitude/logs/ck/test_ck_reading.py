@@ -14,6 +14,7 @@ import spiceypy
 from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.clock.timeline import Policy
+from hilstar.attitude.logs import ck_spice
 from hilstar.attitude.logs.ck import broken_off, reading_of
 from hilstar.attitude.logs.ck_spice import (
     Segment,
@@ -36,6 +37,7 @@ from hilstar.basics.rotation import (
 )
 from hilstar.basics.units import NS_PER_S
 from tests.support.claims import holds
+from tests.support.refusals import refusal
 from tests.support.sources import spice_kernels as ck
 
 MAS = np.radians(1.0 / 3_600_000)
@@ -262,7 +264,18 @@ def test_the_later_segment_has_priority_where_two_overlap(kernels_folder, motion
         mover = other if inside else motion
         assert angle_between_rad(q, mover.quaternion(second)) < 60 * MAS
         assert np.isfinite(rate).all() == inside
-    assert found.breaks.sum() == 2
+    # where each of the later two pieces begins, a little to its side of it
+    assert seconds_of(found)[found.breaks] == pytest.approx([2.0, 2.5], abs=1e-4)
+
+
+def test_the_attitudes_of_all_pieces_are_counted(kernels_folder, motion, monkeypatch):
+    with ck.new_ck(kernels_folder / "a.bc") as handle:
+        ck.write_segment(handle, 3, motion, TIMES[:8], starts=[0.0, 1.0])
+    monkeypatch.setattr(ck_spice, "MAX_SAMPLES", 8)
+    found, _ = read_ck(kernels_folder / "a.bc")
+    assert len(found.t_ns) == 8
+    monkeypatch.setattr(ck_spice, "MAX_SAMPLES", 7)
+    assert "more than 7 attitudes" in refusal(read_ck, kernels_folder / "a.bc")
 
 
 def test_a_ck_counts_before_another_one_that_is_given_as_a_kernel(kernels_folder, motion):

@@ -91,6 +91,10 @@ def test_a_number_beyond_99999_is_one_with_a_letter():
             '<?xml version="1.0" encoding="UTF-08"?><ndm><omm></omm></ndm>',
             r"tles\.txt: is no OMM that can be read \(unknown encoding: UTF-08\)",
         ),
+        (
+            '<?xml version="1.0"?><!DOCTYPE ndm [<!ENTITY a "a">]><ndm><omm></omm></ndm>',
+            r"tles\.txt: has a DOCTYPE, which no OMM has",
+        ),
         (f"{FIRST}\n{NAME}\n{SECOND}\n", r"tles\.txt:2: element line 2 is missing after line 1"),
         (f"{NAME}\n{SECOND}\n", r"tles\.txt:2: element line 1 is missing"),
         (f"{NAME}\n{FIRST}\n", r"tles\.txt: it ends within"),

@@ -39,6 +39,8 @@ HILSTAR = [sys.executable, "-m", "hilstar"]
 # browser, no thread.
 MODULES = (
     "server.bench.build",
+    "server.bench.effort_report",
+    "server.bench.would_do",
     "server.console.publisher",
     "display.render.renderer",
     "server.loop",
@@ -71,6 +73,10 @@ LATER = {
     "pytest": ("pytest", "hilstar.instruments.compare", "astropy.io.fits"),
     "scheduler": ("distributed.cli.dask_scheduler",),
     "simulate": ("astropy.io.fits", "astropy.table", "hilstar.instruments.simulate.batch"),
+    "tracker": (
+        "hilstar.instruments.simulate.live_exposure",
+        "hilstar.instruments.simulate.tracker_process",
+    ),
     "worker": ("distributed.cli.dask_worker", "hilstar.instruments.campaign.pool"),
 }
 LIMITS = (resource.RLIMIT_AS, resource.RLIMIT_CPU, resource.RLIMIT_FSIZE, resource.RLIMIT_NOFILE)
@@ -178,10 +184,12 @@ def prepare() -> None:
     """Import and compute what every command would."""
     for module in MODULES:
         importlib.import_module(f"hilstar.{module}")
+    from hilstar.attitude.logs.log_formats import log_formats
     from hilstar.cli import run_command
     from hilstar.server.bench.bench_file import bench_file_of
     from hilstar.server.bench.build import open_bench
 
+    log_formats()  # each is a module
     # each fork makes its own
     with mock.patch("hilstar.server.bench.build.headless_context", return_value=None):
         # what a process computes once: stars, effort, paths

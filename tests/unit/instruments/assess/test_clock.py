@@ -268,6 +268,23 @@ def test_telemetry_that_began_before_a_steady_slew_is_found_by_its_attitudes():
     assert coarse.turn_rad < np.radians(0.5)
 
 
+def test_an_offset_between_the_steps_of_a_search_beats_one_upon_them_by_a_lap() -> None:
+    """Laps of 120.25 s swing alike to 1 in 2000, and the telemetry began in the second: a lap
+    before is at 80 s, a step of 0.5 s, and the truth is between two.
+    """
+
+    def swung(t_s: FloatArray) -> FloatArray:
+        laps = t_s / 120.25
+        turn_rad = np.radians(20 * (1 + 0.0005 * laps)) * np.sin(2 * np.pi * laps)
+        return scalar_first(Rotation.from_rotvec(turn_rad[:, None] * [0, 0.6, 0.8]))
+
+    run_s = np.arange(0.0, 800.0, 0.01)
+    t_s = np.arange(0.0, 299.0, 0.1)
+    coarse = coarse_offset(Commanded(run_s, swung(run_s)), t_s, swung(t_s + 200.25))
+    assert coarse is not None
+    assert coarse.offset_s == pytest.approx(200.25, abs=1e-3)
+
+
 def test_a_telemetry_s_time_is_put_on_the_run_s_clock() -> None:
     """An hour after a start at 100 s, of a clock 1.25 ms ahead and 12.5 ppm fast."""
     told_s = 100 + 0.00125 + 3600 * (1 + 12.5e-6)

@@ -14,6 +14,7 @@ from hilstar.instruments.assess.clock import (
     CUT_SIGMAS,
     DRIFT_PRIOR,
     FLOOR_ARCSEC,
+    OFFSET_PRIOR_S,
     ClockFit,
     ClockSolver,
     CoarseClock,
@@ -239,6 +240,24 @@ def test_a_drift_that_hardly_shows_is_drawn_to_none(rng, noise_arcsec, told, sig
     smallest, largest = sigmas
     assert smallest * DRIFT_PRIOR < found.sigma_drift < largest * DRIFT_PRIOR
     assert abs(found.drift) < 3 * largest * DRIFT_PRIOR
+
+
+@pytest.mark.parametrize("begun_s", [-7.0, 12.5])
+def test_a_clock_that_no_motion_tells_stays_where_it_was_begun(
+    rng: np.random.Generator, begun_s: float
+) -> None:
+    """Of a sky at rest: offset and drift are known as before, and no better."""
+    q = scalar_first(attitude(lambda t_s: (84 + 0 * t_s, 0 * t_s, 0 * t_s), RUN_S))
+    t_s = START_S + np.arange(20.0, SECONDS - 20.0, ANSWER_S)
+    turn = NOISE_ARCSEC * rng.standard_normal((len(t_s), 3)) / ARCSEC_PER_RAD
+    reported = scalar_first(Rotation.from_rotvec(turn) * Rotation.from_quat(np.roll(q[0], -1)))
+    coarse = CoarseClock(begun_s, 1e-4, np.array([1.0, 0.0, 0.0, 0.0]), len(t_s))
+    found = ClockSolver(Commanded(RUN_S, q), t_s - begun_s, reported, SCALE).fit(coarse)
+    assert found.offset_s == pytest.approx(-begun_s, abs=EXACT_S)
+    assert found.drift * SECONDS == pytest.approx(0.0, abs=EXACT_S)
+    assert found.sigma_offset_s == pytest.approx(OFFSET_PRIOR_S)
+    assert found.sigma_drift == pytest.approx(DRIFT_PRIOR)
+    assert not found.offset_told and not found.drift_told
 
 
 @pytest.mark.parametrize(("begun", "bins", "lag"), [(300, 50, -300), (20, 60, -20)])

@@ -15,6 +15,7 @@ from itertools import takewhile
 import numpy as np
 import pytest
 
+from hilstar.attitude.clock.rate_causes import AS_PACKETS, ReadAs
 from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.receiver import QUEUED_NS, Receiver, Traffic
 from hilstar.attitude.wire.links import Arrival
@@ -31,6 +32,7 @@ from hilstar.basics.notices import Notice, Notices
 from hilstar.basics.process.scheduling import HOST_CLOCK, UNDISCIPLINED_NS, UnixOffset
 from hilstar.basics.rotation import from_radec_roll_deg, propagate
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
+from hilstar.basics.wrong_sky import CONVENTION
 from tests.support.waiting import PATIENCE_S
 
 PERIOD_NS = 5 * NS_PER_MS
@@ -132,6 +134,7 @@ class ReceiverRun:
         make: Callable[[int], list[Arrival]],
         traffic: Traffic | None = None,
         unix_offset=HOST_CLOCK.unix_offset,
+        read_as: ReadAs = AS_PACKETS,
         **script,
     ) -> None:
         clock = Clock()
@@ -147,7 +150,7 @@ class ReceiverRun:
         self.ages_ms: list[float] = []
         self.shown: list[np.ndarray] = []
         self.link = Script(arrivals, clock, self._look, **script)
-        kept = {"now_ns": clock, "unix_offset": unix_offset}
+        kept = {"now_ns": clock, "unix_offset": unix_offset, "read_as": read_as}
         self.receiver = Receiver(
             self.link, self.timeline, traffic or Traffic(), notices=self.notices, **kept
         )
@@ -966,3 +969,19 @@ def test_what_is_no_attitude_is_counted_by_reason_told_once_and_watched():
     assert [sample.sequence for _, _, sample, _ in watched[4:]] == [7, 8]
     reasons = [refusal and refusal.reason for *_, refusal in watched]
     assert reasons == ["format", "crc", "crc", "format", None, "time"]
+
+
+def test_a_stated_convention_that_the_rates_belie_is_told_against_what_was_sent():
+    """The bench file says scalar last, and the sender has it first."""
+    turn = np.radians([0.4, -0.9, 0.6])
+
+    def make(t0: int) -> list[Arrival]:
+        arrivals = []
+        for number, after_ns in enumerate(seconds(0, 3, 10 * NS_PER_MS)):
+            q = propagate(ORION, turn, after_ns / NS_PER_S)
+            sample = AttitudeSample(t0 + after_ns, np.roll(q, 1), turn, number)
+            arrivals.append(Arrival(sample.t_ns + 50_000, sample, encode(sample)))
+        return arrivals
+
+    run = ReceiverRun(make, read_as=ReadAs(scalar="last"))
+    assert '{ scalar = "first" }' in run.notices.lasting[CONVENTION]

@@ -158,6 +158,19 @@ def test_the_glow_of_a_small_screen_is_not_diluted_by_the_detector_around_it(geo
     assert on_screen_median(np.zeros((3, 3))) == 0
 
 
+@pytest.mark.parametrize("turn_deg", [0.0, 30.0, 80.0, -150.0])
+def test_a_glow_is_as_dense_however_the_screen_is_turned(geometry, turn_deg):
+    """Of pixels that are wider than high in neither: as many a square pixel as the scale says."""
+    half = math.radians(turn_deg) / 2
+    q_turned = np.array([math.cos(half), 0.0, 0.0, math.sin(half)])
+    turned = replace(geometry, monitor=monitor_camera((160, 160), 57.65, 120.0, q_turned))
+    black = table_response(8, gamma_response(8).light, black=1e-3)
+    with TwinOptics(turned, GaussianPsf(PSF_PX)) as optics:
+        glow = optics.glow_e_per_s(Panel(black, 1e6))
+    scale = (57.65e-3 / 120) / (13e-3 / 25)
+    assert glow == pytest.approx(1e3 / scale**2, rel=1e-9)
+
+
 def test_a_glow_beyond_a_lens_is_nothing_and_never_nan(geometry):
     """A tracker that sees far past a screen, whose lens is known as far as its corners."""
     small = monitor_camera((16, 12), 57.65, 120.0, np.array([1.0, 0.0, 0.0, 0.0]))

@@ -12,7 +12,7 @@ from hilstar.attitude.logs.log_file import log_timeline
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.rotation import from_rotation_vector
 from hilstar.basics.units import NS_PER_S
-from hilstar.instruments.simulate.exposures import view_at
+from hilstar.instruments.simulate.exposures import log_views, view_at
 from hilstar.instruments.simulate.simulator import Simulator, TrackerBackground, full_e, gathered
 from hilstar.server.bench.cameras import tracker_camera
 from hilstar.tracker.settings import DetectorSettings
@@ -90,6 +90,40 @@ def test_a_log_s_exposures_turn_as_fast_at_its_ends(t_ns):
     view = view_at(timeline, (0, 10**9), t_ns, 0.1)
     assert abs(view.rate_cam_rad_s[1]) == pytest.approx(0.3, rel=1e-6)
     assert view.rate_cam_rad_s[[0, 2]] == pytest.approx([0.0, 0.0], abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("frame_count", "times_ns"),
+    [(None, [0, 3 * 10**8, 10**9]), (5, [0, 25 * 10**7, 5 * 10**8, 75 * 10**7, 10**9]), (1, [0])],
+)
+def test_exposures_are_at_a_log_s_samples_or_evenly_from_the_first_to_the_last(
+    frame_count, times_ns
+):
+    """A turn by 0.3 rad/s about the second axis."""
+    samples = []
+    for t_ns in (0, 3 * 10**8, 10**9):
+        turned = from_rotation_vector(np.array([0.0, 0.3 * t_ns / NS_PER_S, 0.0]))
+        samples.append(AttitudeSample(t_ns, turned))
+    views = log_views(samples, frame_count, 0.1)
+    assert [view.t_ns for view in views] == times_ns
+    for view in views:
+        turned = from_rotation_vector(np.array([0.0, 0.3 * view.t_ns / NS_PER_S, 0.0]))
+        assert view.q_icrs_to_cam == pytest.approx(turned, abs=1e-9)
+        assert abs(view.rate_cam_rad_s[1]) == pytest.approx(0.3, rel=1e-6)
+
+
+def test_a_view_of_a_tracker_has_all_that_it_is_given_in_the_middle_of_its_exposure(tmp_path):
+    q_icrs_to_cam = from_rotation_vector(np.array([0.1, 0.2, 0.3]))
+    rate_rad_s, velocity_km_s, place_km = np.array([[0.4, 0.5, 0.6], [7.0, 8.0, 9.0], [1e3, 2, 3]])
+    with Simulator(bench(tmp_path)) as simulator:
+        view = simulator.view(q_icrs_to_cam, rate_rad_s, 12345, velocity_km_s, place_km)
+        exposure_s = simulator.config.tracker.exposure_s
+    assert view.q_icrs_to_cam.tolist() == q_icrs_to_cam.tolist()
+    assert view.rate_cam_rad_s.tolist() == rate_rad_s.tolist()
+    assert view.t_ns == 12345
+    assert view.velocity_km_s.tolist() == velocity_km_s.tolist()
+    assert view.place_km.tolist() == place_km.tolist()
+    assert (view.scan.hold_s, view.exposed) == (exposure_s, True)
 
 
 @pytest.mark.parametrize(("full_well_e", "full"), [(9_000.0, 8_000.0), (5_000.0, 5_000.0)])

@@ -106,7 +106,8 @@ class PropagatedPlaces(NamedTuple):
     """Places and proper motions at an epoch, (n,), and the covariance (n, 4, 4) of MOTION's
     parameters, mas and mas a year.
 
-    Places are degrees, ICRS; right ascensions' errors and motions carry the cos(dec).
+    Places are degrees, ICRS, right ascensions 0 to 360, whose errors and motions carry the
+    cos(dec).
     """
 
     ra_deg: FloatArray
@@ -152,7 +153,7 @@ def motion_at(
         jacobian[:, 2, k] = varied_pm_ra.imag / STEP
         jacobian[:, 3, k] = varied_pm_dec.imag / STEP
     return PropagatedPlaces(
-        ra_deg=np.degrees(np.arctan2(y, x)),
+        ra_deg=np.degrees(np.arctan2(y, x)) % 360.0,
         dec_deg=np.degrees(np.arctan2(z, flat)),
         pm_ra_mas_yr=pm_ra.real / RAD_PER_MAS,
         pm_dec_mas_yr=pm_dec.real / RAD_PER_MAS,

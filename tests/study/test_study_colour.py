@@ -16,6 +16,7 @@ from hilstar.display.response import srgb_response
 from hilstar.instruments.study import colour
 from hilstar.instruments.study.colour import (
     MONO,
+    MONO_SENSOR,
     NM,
     PANELS,
     PUBLISHED_SUBTYPES,
@@ -27,6 +28,7 @@ from hilstar.instruments.study.colour import (
 )
 from hilstar.optics.sprites import pack_sprites
 from hilstar.server.bench.build import open_bench
+from hilstar.server.bench.star_light import bench_stars
 from hilstar.sky.spectral_types import LETTERS
 from tests.support.claims import holds
 from tests.support.recorded import assert_recorded, assert_row
@@ -375,6 +377,40 @@ def test_the_stars_of_several_frames_are_those_between_two_magnitudes(tmp_path):
     assert colour.is_judged(np.concatenate([ends_mag, ends_mag + 0.01])).tolist() == [
         *(False, False, True, False)
     ]
+
+
+def test_stars_that_are_off_alike_have_that_as_their_figures(tmp_path):
+    """Every channel by 3 %, which is no change of colour, all light by a tenth of a magnitude, and
+    places by a common shift and up to 5 px about it.
+    """
+    colour.write_spectra(tmp_path)
+    step = np.arange(-20.0, 21.0)
+    shares = np.random.default_rng(5).uniform(0.2, 1.0, (len(step), 3))
+    light = np.full(len(step), 10**0.04)
+    off_px = np.array([7.0, -2.0]) + step[:, None] * np.array([0.15, 0.2])
+
+    def subtypes(colours):
+        return 50 * colours[:, 0]
+
+    for sensor in ("Bayer, wide dyes", MONO_SENSOR):
+        file = colour.file_of(tmp_path, "sRGB LCD", sensor)
+        stars = bench_stars(file.config, tmp_path)
+        colours = colour.colours_of(file, stars)
+        shown = colours.shown(shares)
+        wanted = colours.wanted(stars, np.arange(len(step)))
+        wanted[:, : shown.shape[1]] = shown / 1.03
+        told = colour.ShownStars(wanted, shares, light, off_px)
+        off_subtypes, off_percent_k, mag, channel, px = colour.colour_figures(
+            told, colours, subtypes
+        )
+        assert off_subtypes == pytest.approx(50 * (shown[:, 0] * (1 - 1 / 1.03)).mean())
+        assert mag == pytest.approx(0.1)
+        assert px == pytest.approx(np.percentile(0.25 * np.abs(step), 95))
+        if colours.mono:
+            assert channel == pytest.approx(100 * (10**0.04 - 1))
+        else:
+            assert channel == pytest.approx(3.0)
+            assert off_percent_k == pytest.approx(0.0, abs=1e-6)
 
 
 def test_the_worst_place_in_a_mosaic_is_the_furthest_to_either_side():

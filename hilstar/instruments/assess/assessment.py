@@ -721,13 +721,18 @@ def _glass_of(
     bias = from_rotation_vector(found.bias_arcsec / ARCSEC_PER_RAD)
     turned = multiply(bias, found.commanded_q)
     cost = seen_cost(file, turned, centroids) or glass_cost(file, found.commanded_q)
+    return cost, _glass_notes(cost, has_stars=bool(centroids))
+
+
+def _glass_notes(cost: GlassCost | None, *, has_stars: bool) -> list[str]:
+    """Why answers, with or without stars, do not tell a cost that the PSF file tells."""
     if cost is None or cost.source != FILE:
-        return cost, []
-    if centroids:
+        return []
+    if has_stars:
         has = "name too few stars"
     else:
         has = "hold only attitudes, which cannot tell colour from distortion"
-    return cost, [f"the answers {has}: what the glass costs is told by the PSF file"]
+    return [f"the answers {has}: what the glass costs is told by the PSF file"]
 
 
 def matched(run: RunLedger, telemetry: Telemetry, tau_s: FloatArray, q: FloatArray) -> CoarseClock:

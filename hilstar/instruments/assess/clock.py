@@ -37,7 +37,7 @@ from hilstar.basics.rotation import (
     to_matrix,
     to_rotation_vector,
 )
-from hilstar.basics.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
+from hilstar.basics.units import ARCSEC_PER_RAD, MAD_TO_SIGMA, NS_PER_S
 from hilstar.instruments.assess.places import (
     Scale,
     bumps_at,
@@ -109,14 +109,18 @@ def coarse_offset(
     # Starts or ends together, and where speeds or attitudes agree.
     starts_s = float(commanded.t_s[0] - t_s[0])
     ends_s = float(commanded.t_s[-1] - t_s[-1])
-    tried = [_spread_at(commanded, t, q, starts_s), _spread_at(commanded, t, q, ends_s)]
+    places = [(starts_s, 0.0), (ends_s, 0.0)]
     for search in (_by_speed, _by_attitude):
         peaks, reach_s = search(commanded, t_s, reported)
-        for offset_s in peaks.tolist():
-            tried.append(_nearby(commanded, t, q, offset_s, reach_s))
-    known = [clock for clock in tried if clock is not None]
-    if not known:
+        places += [(offset_s, reach_s) for offset_s in peaks.tolist()]
+    tried = []
+    for offset_s, reach_s in places:
+        clock = _spread_at(commanded, t, q, offset_s)
+        if clock is not None:
+            tried.append((clock, reach_s))
+    if not tried:
         return None
+    known = _refined(commanded, t, q, tried)
     smallest_rad = min(clock.spread_rad for clock in known)
     limit = AS_GOOD * smallest_rad + SMALL_RAD
     good = [clock for clock in known if clock.spread_rad <= limit]
@@ -140,12 +144,43 @@ def speed_offsets(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -
     return np.append(offsets_s, 0.0)
 
 
+def _refined(
+    commanded: Commanded,
+    t_s: FloatArray,
+    reported: FloatArray,
+    tried: list[tuple[CoarseClock, float]],
+) -> list[CoarseClock]:
+    """The best offset within reach, s, of each that was tried, where that may be as good as the
+    best of them.
+
+    Within its reach an offset moves no attitude by more than the fastest turn of the run, and the
+    angle between two by twice as much. An attitude is held until the next frame.
+    """
+    frame_q = commanded.q[commanded.shown]
+    interval_s = np.diff(commanded.t_s[commanded.shown])
+    turns_rad = to_rotation_vector(multiply(frame_q[1:], conjugate(frame_q[:-1])))
+    rates_rad_s = np.linalg.norm(turns_rad, axis=1) / np.maximum(interval_s, 1 / NS_PER_S)
+    fastest_rad_s = float(rates_rad_s.max(initial=0.0))
+    held_s = float(interval_s.max(initial=0.0))
+    smallest_rad = min(clock.spread_rad for clock, _ in tried)
+    limit_rad = AS_GOOD * smallest_rad + SMALL_RAD
+    refined = []
+    for clock, reach_s in tried:
+        better_rad = 2 * fastest_rad_s * (reach_s + held_s)
+        if reach_s > 0 and clock.spread_rad - better_rad <= limit_rad:
+            clock = _nearby(commanded, t_s, reported, clock, reach_s)
+        refined.append(clock)
+    return refined
+
+
 def _nearby(
-    commanded: Commanded, t_s: FloatArray, reported: FloatArray, offset_s: float, reach_s: float
-) -> CoarseClock | None:
-    first = _spread_at(commanded, t_s, reported, offset_s)
-    if first is None:
-        return first
+    commanded: Commanded,
+    t_s: FloatArray,
+    reported: FloatArray,
+    first: CoarseClock,
+    reach_s: float,
+) -> CoarseClock:
+    """The best offset within reach of one, or that."""
 
     def spread(offset: float) -> float:
         clock = _spread_at(commanded, t_s, reported, offset)
@@ -153,7 +188,7 @@ def _nearby(
             return np.pi
         return clock.spread_rad
 
-    bounds = (offset_s - reach_s, offset_s + reach_s)
+    bounds = (first.offset_s - reach_s, first.offset_s + reach_s)
     better = optimize.minimize_scalar(
         spread, bounds=bounds, method="bounded", options={"maxiter": 12}
     )
@@ -204,18 +239,18 @@ def _by_attitude(
     first_s = commanded.t_s[0] - t_s[-1]
     last_s = commanded.t_s[-1] - t_s[0]
     reach = np.linspace(first_s, last_s, SCANNED)
-    angle = np.full(len(reach), np.inf)
     shown = commanded.shown
     frame_s = commanded.t_s[shown]
     frame_q = commanded.q[shown]
-    enough = max(3, MIN_OVERLAP * len(t))
-    for k, offset in enumerate(reach):  # the frame after each moment is near enough for a scan
-        frame = np.searchsorted(frame_s, t + offset)
-        inside = (frame > 0) & (frame < len(frame_s))
-        if inside.sum() >= enough:
-            commanded_q = frame_q[frame[inside]]
-            cosine = np.abs((q[inside] * commanded_q).sum(axis=1))
-            angle[k] = float(np.median(1 - np.minimum(cosine, 1)))
+    # The frame after each moment is near enough for a scan.
+    frame = np.searchsorted(frame_s, t + reach[:, None])
+    inside = (frame > 0) & (frame < len(frame_s))
+    enough = inside.sum(axis=1) >= max(3, MIN_OVERLAP * len(t))
+    commanded_q = frame_q[np.minimum(frame[enough], len(frame_s) - 1)]
+    cosine = np.abs(np.einsum("onk,nk->on", commanded_q, q))
+    away = np.where(inside[enough], 1 - np.minimum(cosine, 1), np.nan)
+    angle = np.full(len(reach), np.inf)
+    angle[enough] = np.nanmedian(away, axis=1)
     step_s = float(reach[1] - reach[0])
     return _peaks(-angle, reach), step_s
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,12 @@ from scipy.spatial.transform import Rotation
 from hilstar.basics import charts
 from hilstar.basics.arrays import FloatArray
 from hilstar.instruments.assess import report
-from hilstar.instruments.assess.assessment import AssessSettings, assess_files, lock_of
+from hilstar.instruments.assess.assessment import (
+    AssessSettings,
+    _glass_notes,
+    assess_files,
+    lock_of,
+)
 from hilstar.instruments.assess.bench_effects import display_cost, slices_of, turn_between
 from hilstar.instruments.simulate.glass import split_errors
 from hilstar.instruments.simulate.noise import field_stars
@@ -28,6 +34,7 @@ from hilstar.server.bench.cameras import tracker_camera
 from hilstar.server.bench.star_light import bench_stars
 from hilstar.server.record.commanded import Commanded
 from hilstar.server.record.ledger_records import AnswerRecord
+from tests.support.assessments import an_assessment
 from tests.support.benches import bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.figures import assert_legible
@@ -220,6 +227,22 @@ def test_a_bench_with_a_glass_is_told_what_each_correction_would_leave(tmp_path:
     assert 0.02 < px["without_both"] < 0.04
     assert px["total"] > 1.3 * px["without_distortion"] > 2 * px["without_both"]
     assert glass["fov_arcsec"]["total"]["cross"] > glass["fov_arcsec"]["without_both"]["cross"]
+
+
+def test_a_note_says_why_a_glass_is_told_by_its_file() -> None:
+    by_file = an_assessment().glass
+    assert by_file is not None and by_file.source == "PSF file"
+    by_stars = replace(by_file, source="answers' stars")
+    why = []
+    for has_stars in (False, True):
+        why += _glass_notes(by_file, has_stars=has_stars)
+        assert _glass_notes(by_stars, has_stars=has_stars) == []
+        assert _glass_notes(None, has_stars=has_stars) == []
+    told = "what the glass costs is told by the PSF file"
+    assert why == [
+        f"the answers hold only attitudes, which cannot tell colour from distortion: {told}",
+        f"the answers name too few stars: {told}",
+    ]
 
 
 def test_a_split_finds_what_was_put_together() -> None:

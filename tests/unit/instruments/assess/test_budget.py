@@ -9,6 +9,7 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_rotation_vector, multiply
 from hilstar.instruments.assess.budget import (
     DecomposedRun,
+    _refuse_few,
     assess_cases,
     assess_run,
     intervals_of,
@@ -30,6 +31,7 @@ from tests.support.planted_tracker import (
     slew,
     still,
 )
+from tests.support.refusals import refusal
 
 # What the issue of the budget asks for; statistics alone would allow 1 % of noise (17 000 answers)
 # and 3 % of pixel error.
@@ -179,3 +181,28 @@ def test_few_answers_and_wild_ones_are_refused() -> None:
         assess_cases(
             planted.frames_q[:100], wild / np.linalg.norm(wild, axis=1, keepdims=True), SCALE, rng
         )
+
+
+@pytest.mark.parametrize(
+    ("known", "held", "used", "words"),
+    [
+        (29, 0, 29, "29 answers fall into the run, and 30 are needed; give longer telemetry"),
+        (60, 31, 29, "31 of 60 answers looked while one was held, and 30 others are needed; run"),
+        (60, 31, 29, "run it 1.1 times as long, on a machine with less other work"),
+        (50, 30, 20, "run it 1.5 times as long, on a machine with less other work"),
+        (40, 40, 0, "run it on a machine with less other work"),
+        (60, 0, 30, "half or more of the answers are wild: 30 of 60 agree with one rotation"),
+        (90, 30, 30, "30 of 60 agree"),
+    ],
+)
+def test_a_run_s_answers_are_counted_before_they_are_judged(
+    known: int, held: int, used: int, words: str
+) -> None:
+    """Of 100 rows; with one answer more of what was too few none is refused."""
+
+    def first(count: int) -> np.ndarray:
+        return np.arange(100) < count
+
+    assert words in refusal(_refuse_few, first(known), first(held), first(used))
+    for fewest_known, fewest_held, fewest_used in ((30, 0, 16), (60, 30, 16), (60, 0, 31)):
+        _refuse_few(first(fewest_known), first(fewest_held), first(fewest_used))

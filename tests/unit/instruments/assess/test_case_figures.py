@@ -117,14 +117,16 @@ def test_the_noise_of_rates_at_rest_is_their_standard_deviation(rng: np.random.G
         assert figure.value == pytest.approx(math.sqrt(variance))
 
 
-def test_a_scale_is_told_about_axes_that_all_turn(rng: np.random.Generator):
+def test_a_scale_and_a_lag_are_told_about_axes_that_all_turn(rng: np.random.Generator):
     rates = np.zeros((12, 3))
     rates[:, 0] = np.linspace(-1, 1, 12)
     rates[:, 2] = 0.5
     noise = 1e-3 * rng.standard_normal((12, 3))
-    table = RateTable(np.arange(12), rates, 0.02 * rates + noise, rates**2)
-    scale = rate_figure("rate-scale", table, [0], CONFIDENCE, rng)
-    assert scale.value == pytest.approx(0.02, rel=0.1)
+    errors = 0.02 * rates - 0.03 * rates**2 + noise
+    table = RateTable(np.arange(12), rates, errors, rates**2)
+    for quantity, size in (("rate-scale", 0.02), ("rate-lag", 0.03)):
+        figure = rate_figure(quantity, table, [0], CONFIDENCE, rng)
+        assert figure.value == pytest.approx(size, rel=0.1)
     for axes in ([1], [2], [0, 1]):
         with pytest.raises(TooFewCases, match="no case turns at several rates about that axis"):
             rate_figure("rate-scale", table, axes, CONFIDENCE, rng)

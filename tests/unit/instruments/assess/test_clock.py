@@ -14,6 +14,7 @@ from hilstar.instruments.assess.clock import (
     CUT_SIGMAS,
     DRIFT_PRIOR,
     FLOOR_ARCSEC,
+    OFFSET_PRIOR_S,
     ClockFit,
     ClockSolver,
     CoarseClock,
@@ -241,6 +242,24 @@ def test_a_drift_that_hardly_shows_is_drawn_to_none(rng, noise_arcsec, told, sig
     assert abs(found.drift) < 3 * largest * DRIFT_PRIOR
 
 
+@pytest.mark.parametrize("begun_s", [-7.0, 12.5])
+def test_a_clock_that_no_motion_tells_stays_where_it_was_begun(
+    rng: np.random.Generator, begun_s: float
+) -> None:
+    """Of a sky at rest: offset and drift are known as before, and no better."""
+    q = scalar_first(attitude(lambda t_s: (84 + 0 * t_s, 0 * t_s, 0 * t_s), RUN_S))
+    t_s = START_S + np.arange(20.0, SECONDS - 20.0, ANSWER_S)
+    turn = NOISE_ARCSEC * rng.standard_normal((len(t_s), 3)) / ARCSEC_PER_RAD
+    reported = scalar_first(Rotation.from_rotvec(turn) * Rotation.from_quat(np.roll(q[0], -1)))
+    coarse = CoarseClock(begun_s, 1e-4, np.array([1.0, 0.0, 0.0, 0.0]), len(t_s))
+    found = ClockSolver(Commanded(RUN_S, q), t_s - begun_s, reported, SCALE).fit(coarse)
+    assert found.offset_s == pytest.approx(-begun_s, abs=EXACT_S)
+    assert found.drift * SECONDS == pytest.approx(0.0, abs=EXACT_S)
+    assert found.sigma_offset_s == pytest.approx(OFFSET_PRIOR_S)
+    assert found.sigma_drift == pytest.approx(DRIFT_PRIOR)
+    assert not found.offset_told and not found.drift_told
+
+
 @pytest.mark.parametrize(("begun", "bins", "lag"), [(300, 50, -300), (20, 60, -20)])
 def test_a_lag_is_where_the_longer_recording_began_before_the_shorter(begun, bins, lag, rng):
     """A piece of 400 bins, that begins so many after them; and the other way round."""
@@ -266,6 +285,23 @@ def test_telemetry_that_began_before_a_steady_slew_is_found_by_its_attitudes():
     assert coarse is not None
     assert coarse.offset_s == pytest.approx(START_S - 10.0, abs=0.5)
     assert coarse.turn_rad < np.radians(0.5)
+
+
+def test_an_offset_between_the_steps_of_a_search_beats_one_upon_them_by_a_lap() -> None:
+    """Laps of 120.25 s swing alike to 1 in 2000, and the telemetry began in the second: a lap
+    before is at 80 s, a step of 0.5 s, and the truth is between two.
+    """
+
+    def swung(t_s: FloatArray) -> FloatArray:
+        laps = t_s / 120.25
+        turn_rad = np.radians(20 * (1 + 0.0005 * laps)) * np.sin(2 * np.pi * laps)
+        return scalar_first(Rotation.from_rotvec(turn_rad[:, None] * [0, 0.6, 0.8]))
+
+    run_s = np.arange(0.0, 800.0, 0.01)
+    t_s = np.arange(0.0, 299.0, 0.1)
+    coarse = coarse_offset(Commanded(run_s, swung(run_s)), t_s, swung(t_s + 200.25))
+    assert coarse is not None
+    assert coarse.offset_s == pytest.approx(200.25, abs=1e-3)
 
 
 def test_a_telemetry_s_time_is_put_on_the_run_s_clock() -> None:

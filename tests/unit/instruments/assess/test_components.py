@@ -125,6 +125,23 @@ def test_where_the_sky_stands_all_about_the_mean_is_noise(rng) -> None:
     assert "moved by 0 px only" in found.fov.reason and "moved by 0 px only" in found.pixel.reason
 
 
+def test_a_field_that_moved_by_less_than_two_pixels_tells_no_pixel_error(rng) -> None:
+    """By a wave within a pixel of twice the noise, along a row of the detector."""
+    error = rng.normal(size=(600, 3))
+    for moved_px, told in ((1.9, False), (30.0, True)):
+        off_px = np.linspace(0.0, moved_px, len(error))
+        turn = np.zeros((len(error), 3))
+        turn[:, 1] = np.arctan(off_px / SCALE.focal_px)
+        q = scalar_first(Rotation.from_rotvec(turn))
+        wave = 2.8 * np.sin(2 * np.pi * off_px)[:, None]
+        found = components_of(error + wave, q, SCALE)
+        assert (found.pixel.reason == "") == told
+        if not told:
+            assert found.pixel.reason == (
+                "the star field moved by 1.9 px only: pixel error cannot be told from bias"
+            )
+
+
 def test_the_noise_of_few_answers_has_the_freedom_that_is_left_by_the_fits() -> None:
     """Of 24 runs' axes with some 130 numbers each the mean is known to 0.025; 150 for the freedom
     would be 0.1 too little.

@@ -15,6 +15,7 @@ from hilstar.instruments.assess.budget import _beside_field, _field_interval, _l
 from hilstar.instruments.assess.components import Component, Components
 from hilstar.instruments.assess.look_alikes import (
     SLOW_WAVES,
+    SURE_SIGMAS,
     LookAlikes,
     clock_covariance,
     slow_variance,
@@ -28,6 +29,8 @@ ANSWERS, BUMPS, SECONDS = 600, 12, 300.0
 PRIOR_SIGMA = np.array([10.0, 2e-3])
 WIDE_ARCSEC2 = np.full(3, 1e12)  # a field of any size: the prior of the clock alone
 TRIES = 300
+# cosines at 600 times with both ends are orthogonal but for 2 / 600; waves of two kinds add up
+ORTHOGONAL = 0.01
 # binomial: of 300 bounds at 97.5 %, 283 and fewer hold once in 1000
 MIN_HELD = 284
 # Of an interval of 95 %, of 8 three and more miss once in 170; of one that held in a quarter of
@@ -110,6 +113,24 @@ def test_a_slow_change_adds_no_more_than_its_bound(
         bound = slow_variance(t_s, bumps, error - bumps.fit(error))
         held += (added**2).mean(axis=0)[0] <= bound[0]
     assert held >= MIN_HELD
+
+
+@pytest.mark.parametrize("half_waves", range(1, SLOW_WAVES + 1))
+def test_a_field_that_takes_one_slow_wave_whole_hides_its_share_of_the_noise(
+    rng: np.random.Generator, half_waves: int
+) -> None:
+    """What the field takes shows in no residual: a wave's size is then as before, a share of the
+    noise, and its square is of one degree of freedom.
+    """
+    t_s = swing()
+    wave = np.cos(np.pi * half_waves * t_s / SECONDS)
+    field = Projector(sparse.csr_matrix((wave - wave.mean())[:, None]))
+    error = rng.standard_normal((ANSWERS, 3)) * np.array([1.0, 2.0, 10.0])
+    left = error - field.fit(error)
+    variance = (left**2).sum(axis=0) / (ANSWERS - 2)
+    bound = slow_variance(t_s, field, left)
+    wanted = variance / SLOW_WAVES * (1 + SURE_SIGMAS * np.sqrt(2))
+    assert bound == pytest.approx(wanted, rel=ORTHOGONAL)
 
 
 def test_the_field_error_of_five_minutes_is_in_its_interval() -> None:

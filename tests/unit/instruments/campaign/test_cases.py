@@ -4,9 +4,11 @@ light against the sky's.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from astropy.coordinates import get_sun
@@ -18,7 +20,7 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import angle_between_rad, from_radec_roll_deg, propagate, to_matrix
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
 from hilstar.instruments.assess.places import Scale
-from hilstar.instruments.campaign.cases import CaseMaker, beside_q, value_kind
+from hilstar.instruments.campaign.cases import CaseMaker, beside_q, first_row, value_kind
 from hilstar.instruments.campaign.job import Job, files_sha256
 from hilstar.instruments.campaign.plan import Design, Parameter, parse_plan
 from hilstar.instruments.campaign.session import Session
@@ -31,6 +33,7 @@ from hilstar.sky.bodies.shapes import EQUATOR_KM
 from tests.support.benches import ROOT
 from tests.support.campaigns import write_campaign
 from tests.support.commands import run_hilstar_here
+from tests.support.refusals import refusal
 
 
 def cases_session(folder: Path, images: bool = False) -> Session:
@@ -77,6 +80,51 @@ def test_a_case_does_not_depend_on_the_cases_before_it(tmp_path: Path) -> None:
         assert len({row[name] for row in forwards}) == 6
     first.close()
     second.close()
+
+
+def test_a_case_s_row_has_its_own_bench_and_each_value_in_its_column_s_kind(
+    tmp_path: Path,
+) -> None:
+    sigma = {"key": "tracker.psf_sigma_px", "minimum": 0.5, "maximum": 1.0}
+    write_campaign(tmp_path, sigma)
+    this = cases_session(tmp_path)
+    where = points(this, 2)
+    for number in range(2):
+        row = this.row(number, where[number])
+        case = this.maker.case(number, where[number])
+        assert row["bench_sha256"] == this.maker.bench(case).sha256 != this.file.sha256
+        sigma_px = 0.5 * (1 + where[number][-1])
+        assert row["vary.tracker.psf_sigma_px"] == pytest.approx(sigma_px)
+    this.close()
+    mixed = replace(case, values={"a": 3, "b": "three", "c": True, "d": 3})
+    kinds = {
+        "vary.a": "text",
+        "vary.b": "text",
+        "vary.c": "bool",
+        "vary.d": "int64",
+        "flux": "text",
+    }
+    row = first_row(mixed, kinds)
+    varied = [row[name] for name in kinds]
+    assert varied == ["3", "three", True, 3, None]
+    assert row["case"] == 1 and row["noise_seed"] == case.noise_seed
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("bench_sha256", "is not the campaign's 000000000000: a file that"),
+        ("files_sha256", "its log or scenario is not the campaign's: a file that"),
+    ],
+)
+def test_a_worker_with_another_file_than_the_campaign_s_is_refused(
+    tmp_path: Path, name: str, words: str
+) -> None:
+    write_campaign(tmp_path)
+    this = cases_session(tmp_path)
+    this.close()
+    line = refusal(Session, msgspec.structs.replace(this.job, **{name: "0" * 64}))
+    assert words in line and line.endswith("copy it")
 
 
 def test_a_case_is_made_again_by_simulate_and_its_image_has_its_truth(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ what becomes of those of one that fails or goes.
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import CancelledError
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,8 @@ class Future:
         try:
             self._value = self._answer()
             self.status = "finished"
+        except CancelledError:
+            self.status = "cancelled"
         except Exception as error:
             self._error = error
             self.status = "error"
@@ -249,6 +252,24 @@ def test_a_task_that_fails_refuses_its_worker_and_one_that_kills_it_is_lost(
     assert [begin for begin, _ in run.lost[-3:]] == [7] * 3
     assert [at_fault for _, at_fault in run.lost if at_fault is not None] == [7]
     assert sorted(run.cases) == sorted(set(range(CASES)) - {7})
+
+
+def test_tasks_of_a_connection_that_ended_are_given_back_and_no_worker_is_blamed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cut = [4, 3]
+
+    def cuts(function: Any, job: Job, begin: int = 0, points: Any = ()) -> Any:
+        if function is not examine and begin in cut:
+            cut.remove(begin)
+            raise CancelledError
+        return works(function, job, begin, points)
+
+    run = ClusterRun(tmp_path, monkeypatch, [{"a": 1, "b": 2}], {"a": cuts, "b": cuts})
+    run.run()
+    assert cut == []
+    assert sorted(run.cases) == list(range(CASES))
+    assert run.lost == [] and run.said == []
 
 
 def test_a_campaign_without_a_worker_or_a_scheduler_ends_in_a_line(

@@ -32,6 +32,7 @@ def shown_file(
     quantisation: str = "exact",
     background: Any = None,
     monitor: dict[str, Any] | None = None,
+    faintest_v_mag: float = 4.0,
     **tracker: Any,
 ) -> BenchFile:
     """A bench file whose display covers the tracker's field."""
@@ -43,7 +44,7 @@ def shown_file(
             "exposure_s": EXPOSURE_S,
             **tracker,
         },
-        "sky": {"faintest_v_mag": 4.0},
+        "sky": {"faintest_v_mag": faintest_v_mag},
         "monitor": {
             "resolution_px": [640, 480],
             "bits": 10,
@@ -140,3 +141,23 @@ def test_a_quantisation_that_was_chosen_stays_where_the_display_does(tmp_path: P
         assert tracker._bench.config.tracker.principal_point_px == (50.5, 29.0)
         assert tracker._bench.config.render == chosen
     assert chosen.quantisation != "auto"
+
+
+def test_the_stars_of_a_truth_that_are_drawn_make_all_of_its_image(tmp_path: Path) -> None:
+    """On codes of 6 bits: a catalogue that ends before the brightest of the others gives the same."""
+    images = []
+    counts = []
+    faintest_v_mag = 12.0
+    for name in ("deep", "shallow"):
+        path = tmp_path / f"{name}.toml"
+        file = shown_file(path, monitor={"bits": 6}, faintest_v_mag=faintest_v_mag)
+        with contextlib.closing(DisplayTracker(file)) as tracker:
+            exposure = tracker.expose(View.exposure(RIGEL, STILL, EXPOSURE_S), None)
+        images.append(exposure.mean_e)
+        drawn = exposure.truth["drawn"]
+        counts.append((int(drawn.sum()), len(drawn)))
+        if name == "deep":
+            faintest_v_mag = float(exposure.truth["v_mag"][~drawn].min()) - 1e-6
+    (drawn_of_deep, of_deep), (drawn_of_shallow, of_shallow) = counts
+    assert 0 < drawn_of_deep == drawn_of_shallow == of_shallow < of_deep
+    np.testing.assert_array_equal(*images)

@@ -173,6 +173,8 @@ def test_the_chart_has_each_case_s_error_an_axis_about_the_median_at_its_rate(re
     assert axes.texts[0].get_text() == f"nea {verdicts[1].verdict}"
     assert axes.get_xscale() == "log"
     assert 30.0 < axes.get_ylim()[1] < 5e3
+    met = [each.verdict for each in verdicts].count(MET)
+    assert figure.get_suptitle() == f"{met} of 3 requirements are met"
 
 
 @pytest.mark.parametrize(

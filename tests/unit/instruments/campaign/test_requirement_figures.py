@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.spatial.transform import Rotation
 
 from hilstar.instruments.assess.bounded_figures import (
     BoundedFigure,
@@ -127,6 +128,23 @@ def test_the_noise_within_cases_is_pooled_by_their_freedom():
     assert verdict.cases == 2
     within = found(cases, "nea", maximum=9.0, axis="x", share=0.997)
     assert within.value == pytest.approx(stats.norm.ppf(0.9985) * math.sqrt(84 / 12))
+
+
+def test_the_noise_of_cases_of_one_frame_is_that_between_them(rng):
+    """All over the sky, where nothing repeats: their standard deviation about the mean."""
+    attitudes = Rotation.random(40, random_state=5).as_quat(scalar_first=True)
+    errors = np.array([2.0, 3.0, 20.0]) * rng.standard_normal((40, 3)) + 50.0
+    columns = {f"error_{axis}_arcsec": errors[:, k] for k, axis in enumerate("xyz")}
+    for k, axis in enumerate("wxyz"):
+        columns[f"q{axis}"] = columns[f"solved_q{axis}"] = attitudes[:, k]
+    scatter = {f"scatter_{axis}_arcsec": np.full(40, np.nan) for axis in "xyz"}
+    once = np.ones(40)
+    cases = cases_of(frames=once, solved=once, wrong=0 * once, **columns, **scatter)
+    for axis, chosen in (("x", [0]), ("cross", [0, 1]), ("roll", [2])):
+        verdict = found(cases, "nea", maximum=900.0, axis=axis)
+        variance = errors[:, chosen].var(axis=0, ddof=1).mean()
+        assert verdict.value == pytest.approx(math.sqrt(variance))
+        assert verdict.cases == 40
 
 
 def test_a_bias_of_one_axis_has_student_s_limits():

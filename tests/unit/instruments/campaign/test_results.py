@@ -229,6 +229,35 @@ def test_a_budget_of_many_cases_is_that_of_an_even_share_of_them(
     assert budget["availability"] == 1.0
 
 
+def test_a_summary_counts_the_cases_of_each_reason_to_fail(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of ten cases three have no log and two no stars: too few for a budget, and a note says so."""
+    monkeypatch.setattr(results, "noise_limit", lambda file, commanded: Axes(None, None))
+    write_campaign(tmp_path)
+    numbers = ["frames", "solved", "wrong"]
+    for form, names in (("q{}", "wxyz"), ("solved_q{}", "wxyz"), ("error_{}_arcsec", "xyz")):
+        numbers += [form.format(name) for name in names]
+    numbers += [f"scatter_{axis}_arcsec" for axis in "xyz"]
+    rows = []
+    for case, why in enumerate(["", "no log", "no stars", "", "no log"] * 2):
+        row = dict.fromkeys(numbers) | {"case": case, "why": why, "status": "done"}
+        if why and case != 7:
+            row["status"] = "failed"
+        else:
+            row |= {"frames": 4.0, "solved": 3.0, "wrong": 1.0}
+        rows.append(row)
+    kinds = dict.fromkeys(numbers, "float64") | {"case": "int64", "why": "text", "status": "text"}
+    table = tmp_path / "cases.parquet"
+    write_table(table, schema_of(kinds, {}), iter([rows]))
+    summary = write_results(table, read_bench_file(tmp_path / "bench.toml"), 1)
+    assert (summary["cases"], summary["failed"]) == (10, 5)
+    assert summary["failed_because"] == {"no log": 4, "no stars": 1}
+    assert (summary["availability"], summary["wrong"]) == (0.5, 5)
+    assert summary["notes"] == ("0 answers, and 30 are needed; plan more cases",)
+    assert not list(tmp_path.glob("*.png"))
+
+
 def test_the_scatter_within_cases_is_that_of_those_with_several_frames() -> None:
     scatter = np.array([[3.0, 4.0, 20.0], [np.nan] * 3, [1.0, 2.0, 10.0]])
     found = results._scatter_arcsec(columns_of(**vectors_of("scatter_{}_arcsec", "xyz", scatter)))

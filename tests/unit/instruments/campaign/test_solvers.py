@@ -42,6 +42,9 @@ EXAMPLES = ROOT / "examples"
 # the field's lever for roll.
 CROSS_LIMIT_ARCSEC = 5 * 4 / np.sqrt(12)
 ROLL_LIMIT_ARCSEC = 30 * CROSS_LIMIT_ARCSEC
+# Five sigma of a DN's rounding, 0.29 DN, in the faintest star: 590 DN in a PSF of 0.55 px, whose
+# place a fit knows to 0.29 sqrt(8 pi) 0.55^2 / 590 px.
+CLEAN_PX = 5 * 0.29 * np.sqrt(8 * np.pi) * 0.55**2 / 590
 SAME_TURN_ARCSEC = 1e-6  # float64 on 1e6 arcsec, over a dozen stars
 
 
@@ -81,6 +84,21 @@ def test_a_solver_finds_the_commanded_attitude_in_the_pixels(
         and abs(error_arcsec[2]) < ROLL_LIMIT_ARCSEC
     )
     assert np.abs(error_arcsec).max() > 0
+
+
+@pytest.mark.parametrize("psf", ["tracker", "gaussian"])
+def test_a_fit_of_the_true_psf_has_each_star_where_it_stands(
+    seen: tuple[Simulator, Exposure], psf: str
+) -> None:
+    """Without noise all that is left is the rounding to a DN."""
+    simulator, exposure = seen
+    clean = simulator.expose(exposure.view, None)
+    settings = Centroiding(centroider="psf", psf=psf)
+    answer = choose_solver("centroids", settings, EXAMPLES, 60.0).solve(clean, simulator)
+    assert answer.star_errors is not None
+    off_px = np.concatenate([answer.star_errors.dx_px, answer.star_errors.dy_px])
+    assert len(off_px) > 10
+    assert np.abs(off_px).max() < CLEAN_PX
 
 
 def test_an_error_is_the_rotation_vector_from_the_commanded_to_the_reported_attitude() -> None:

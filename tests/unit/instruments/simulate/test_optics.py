@@ -171,6 +171,23 @@ def test_a_glow_is_as_dense_however_the_screen_is_turned(geometry, turn_deg):
     assert glow == pytest.approx(1e3 / scale**2, rel=1e-9)
 
 
+def test_a_glow_is_as_uneven_as_the_panel_at_the_pixel_that_is_seen(geometry, rng):
+    """A screen of 28 x 32 px, each of which is two of the tracker's: beside it there is no light, and
+    below it there is no detector.
+    """
+    screen = monitor_camera((28, 32), 124.8, 120.0, np.array([1.0, 0.0, 0.0, 0.0]))
+    uneven = rng.uniform(0.5, 1.0, (32, 28))
+    black = table_response(8, gamma_response(8).light, black=1e-3)
+    with TwinOptics(replace(geometry, monitor=screen), GaussianPsf(PSF_PX)) as optics:
+        glow = optics.glow_e_per_s(Panel(black, 1e6, uniformity=uneven))
+    column = np.floor((np.arange(60) - 29.5) / 2 + 14).astype(int)
+    row = np.floor((np.arange(50) - 24.5) / 2 + 16).astype(int)
+    is_seen = (column >= 0) & (column < 28)
+    assert is_seen.sum() == 56
+    assert glow[:, is_seen] == pytest.approx(1e3 / 4 * uneven[row[:, None], column[is_seen]])
+    assert not glow[:, ~is_seen].any()
+
+
 def test_a_glow_beyond_a_lens_is_nothing_and_never_nan(geometry):
     """A tracker that sees far past a screen, whose lens is known as far as its corners."""
     small = monitor_camera((16, 12), 57.65, 120.0, np.array([1.0, 0.0, 0.0, 0.0]))

@@ -212,16 +212,17 @@ def test_a_glow_is_the_same_in_bands_of_rows(geometry, monkeypatch):
     assert np.array_equal(bands, whole)
 
 
-def test_what_a_wide_pixel_beside_the_detector_lights_of_it_is_there(geometry):
-    """A monitor pixel of 9 tracker pixels whose middle is 4 px off the detector, against the
-    integral over its square.
+@pytest.mark.parametrize("beside_px", [(-4.0, 25.0), (63.0, 25.0), (30.0, -4.0), (30.0, 53.0)])
+def test_what_a_wide_pixel_beside_the_detector_lights_of_it_is_there(geometry, beside_px):
+    """A monitor pixel of 9 tracker pixels whose middle is about 4 px off one of the detector's sides,
+    against the integral over its square.
     """
-    wide = replace(
-        geometry, monitor=monitor_camera((64, 48), 576.5, 120.0, np.array([1.0, 0.0, 0.0, 0.0]))
-    )
+    upright = np.array([1.0, 0.0, 0.0, 0.0])
+    screen = monitor_camera((64, 48), 576.5, 120.0, upright, (31.5, 23.0))
+    wide = replace(geometry, monitor=screen)
     x_px, y_px = (part.ravel() for part in np.meshgrid(np.arange(64.0), np.arange(48.0)))
     seen_x, seen_y = wide.to_tracker(x_px, y_px)
-    beside = int(np.argmin(np.hypot(seen_x + 4.0, seen_y - 25.0)))
+    beside = int(np.argmin(np.hypot(seen_x - beside_px[0], seen_y - beside_px[1])))
     light = np.zeros((48, 64))
     light.ravel()[beside] = 1.0
     with TwinOptics(wide, GaussianPsf(PSF_PX)) as optics:

@@ -257,6 +257,23 @@ def test_a_glass_s_square_is_about_the_pixel_whose_half_sides_hold_the_star(star
     assert wanted.count(3) == 1
 
 
+def test_a_told_glass_is_what_is_drawn_about_a_pixel_at_each_star_s_place(glass_file):
+    """Four stars in two corners and near the middle of a field that is not symmetric, each in the
+    square about a pixel that may be beside the nearest.
+    """
+    file = glass_file()
+    glass = tracker_psf(file.config.tracker, file.folder)
+    x_px, y_px = np.array([[30.2, 60.4, 200.6, 225.3], [170.7, 40.1, 90.8, 215.9]])
+    rows, columns = np.rint(y_px + 0.3).astype(int), np.rint(x_px - 0.3).astype(int)
+    told = told_psf(glass, (rows, columns), 13)(x_px - columns, y_px - rows)
+    drawn = glass.image(x_px, y_px, glass.mean_shares, np.ones(4), (SIDE_PX, SIDE_PX))
+    for square, row, column in zip(told, rows, columns, strict=True):
+        about = drawn[row - 6 : row + 7, column - 6 : column + 7]
+        # drawn in float32
+        assert square == pytest.approx(about, abs=1e-6)
+        assert square.sum() > 0.9
+
+
 def test_what_the_file_does_not_cover_is_said(glass_file, caplog):
     wide = glass_file(
         {"tracker": {"resolution_px": [300, SIDE_PX]}, "tracker.optics": {"focus_um": 7.0}}

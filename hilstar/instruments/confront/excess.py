@@ -237,9 +237,8 @@ def _blends(session: Session, sightings: _Sightings) -> Part:
         dx_px = stars.x_px - row.x_predicted_px
         dy_px = stars.y_px - row.y_predicted_px
         overlap = np.exp(-(dx_px**2 + dy_px**2) / (4 * variance_px2))
-        added_dn = stars.dn * overlap * (stars.star != row.star)
-        added_mag.append(MAG * float(added_dn.sum()) / row.dn_predicted)
-    # the mean of it is in the zero point
+        added_mag.append(MAG * float((stars.dn * overlap).sum()) / row.dn_predicted)
+    # the mean of it, and a star's own light, which is the same share of each, is in the zero point
     spread_mag = np.array(added_mag) - np.mean(added_mag)
     return Part(
         "catalogue: blends",

@@ -93,12 +93,7 @@ def confront(
             " grey"
         ) from error
     make_directory(output)
-    names: tuple[str, ...] = OUTPUTS
-    if fixed and has_screen:
-        tracker = bench
-        names = RESULTS
-    else:
-        tracker = write_tracker(output, session, has_screen)
+    tracker, names = _judged_by(bench, output, session, has_screen=has_screen)
     judgement = _judge(session, tracker, tell, advance)
     excess = split_excess(session, judgement.verdicts)
     lines = lines_of(session, judgement.verdicts, excess, judgement.defects)
@@ -117,6 +112,17 @@ def confront(
     write_page(output / "index.html", result, judgement.pictures)
     advance(100)
     return result
+
+
+def _judged_by(
+    bench: Path, output: Path, session: Session, *, has_screen: bool
+) -> tuple[Path, tuple[str, ...]]:
+    """The bench file of the tracker that photographs are held against, and the names of what is
+    written: that of a fixed camera before a screen is its own, any other is written.
+    """
+    if session.fixed and has_screen:
+        return bench, RESULTS
+    return write_tracker(output, session, has_screen), OUTPUTS
 
 
 def _read(file: BenchFile, images: Sequence[Path], at_ns: int | None) -> list[Photograph]:

@@ -98,8 +98,8 @@ def sky_under(dn: DigitalNumbers) -> Sky:
         chosen = near
         shape = _fitted(terms, blocks.level, chosen)
     height, width = dn.shape
-    across = np.linspace(-1, 1, width)
-    down = np.linspace(-1, 1, height)
+    across = _middles(width, 1, width)
+    down = _middles(height, 1, height)
     rows = [_terms(across, np.full(width, row)) @ shape for row in down]
     return Sky(np.array(rows), noise_dn)
 
@@ -119,9 +119,16 @@ def _blocks(dn: DigitalNumbers) -> _Blocks:
     deviation = np.abs(pixels - level[:, None])
     noise = MAD_TO_SIGMA * np.median(deviation, axis=1)
     row, column = np.indices((rows, columns)).reshape(2, -1)
-    across = (2 * column + 1) * wide / width - 1
-    down = (2 * row + 1) * high / height - 1
+    across = _middles(columns, wide, width)[column]
+    down = _middles(rows, high, height)[row]
     return _Blocks(level, noise, across, down)
+
+
+def _middles(count: int, step_px: int, size_px: int) -> FloatArray:
+    """The middles (count,) of parts of `step_px` along a side of `size_px`, -1 and 1 at its
+    edges.
+    """
+    return np.asarray((2 * np.arange(count) + 1) * step_px / size_px - 1)
 
 
 def _terms(across: FloatArray, down: FloatArray) -> FloatArray:

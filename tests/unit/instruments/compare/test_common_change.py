@@ -14,6 +14,7 @@ from hilstar.instruments.compare.sky_comparison import (
     SkyComparison,
     StarDifference,
     common_change,
+    common_motion,
     fitted_motion,
     rank_for,
 )
@@ -52,6 +53,19 @@ def test_what_turns_and_grows_about_the_middle_shifts_nothing_there(turn_deg, sc
     assert common.rotation_deg == pytest.approx(turn_deg, abs=ROUNDING)
     assert common.scale_error == pytest.approx(scale - 1, abs=ROUNDING)
     assert common.differing == []
+
+
+@pytest.mark.parametrize(("shift_px", "is_named"), [(0.0099, False), (0.0101, True)])
+def test_a_shift_is_named_where_it_moves_half_of_the_stars_beyond_their_limit(shift_px, is_named):
+    """Of 40 stars, 19 of which it moves further than the limit of 0.01 px, all by the same motion."""
+    places = np.column_stack([np.linspace(-80, 80, 40), 30 * np.cos(np.arange(40.0))])
+    moves = np.tile([shift_px, 0.0], (40, 1))
+    moves[1::2, 0] += 0.001
+    moves[1, 0] = shift_px
+    motion = common_motion(places, moves, np.full(40, 0.01))
+    assert (motion is not None) is is_named
+    if motion is not None:
+        assert motion(places)[0] == pytest.approx([shift_px, 0.0], abs=0.0011)
 
 
 def test_a_motion_is_as_rich_as_its_stars_allow():

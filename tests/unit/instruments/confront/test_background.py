@@ -11,6 +11,7 @@ from hilstar.instruments.confront.background import (
     PATTERN_CLIP,
     THRESHOLD,
     _quiet,
+    _single,
     find_sources,
     is_round,
     sky_level,
@@ -121,6 +122,20 @@ def test_one_pixel_s_light_is_the_detector_s():
     found = find_sources(dn)
     assert found.places_px[found.single] == pytest.approx(np.array([[15.0, 25.0]]), abs=1e-3)
     assert len(found) == 2
+
+
+@pytest.mark.parametrize(("beside", "is_single"), [(12.9, True), (13.1, False)])
+def test_the_highest_pixel_of_nine_is_alone_by_what_its_four_neighbours_have(beside, is_single):
+    """A pixel of 100 sigmas at each of the nine about a place: 4 of them a neighbour are a star's,
+    of which noise has 0.75.
+    """
+    for row in (-1, 0, 1):
+        for column in (-1, 0, 1):
+            sigmas = np.zeros((40, 60))
+            sigmas[12 + row, 33 + column] = 100.0
+            sigmas[12 + row, 33 + column + 1] = beside
+            places_px = np.array([33.4]), np.array([11.6])
+            assert _single(sigmas, *places_px).tolist() == [is_single]
 
 
 def test_what_is_under_the_threshold_is_no_source():

@@ -9,10 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from scipy.stats import binom
 
 from hilstar.basics.rotation import from_matrix, from_rotation_vector, multiply, to_matrix
 from hilstar.instruments.confront import lost_in_space
 from hilstar.instruments.confront.camera_fit import (
+    GAIN,
     CameraFit,
     Places,
     Pointing,
@@ -24,6 +26,7 @@ from hilstar.instruments.confront.camera_fit import (
 from hilstar.instruments.confront.judge import _dim_regions, _Explanation
 from hilstar.instruments.confront.lost_in_space import (
     CIRCLE,
+    MAX_CHANCE,
     STARS_A_CIRCLE,
     SourceField,
     _by_hypothesis,
@@ -355,6 +358,58 @@ def test_triangles_of_the_sky_are_of_two_and_a_half_times_the_stars_that_a_circl
     stars = 2.5 * STARS_A_CIRCLE * circles
     assert stars < len(vectors)
     assert 0.75 * stars < sky.triples.max() < stars + 1
+
+
+@pytest.mark.parametrize("matched", [12, 13, 14, 15])
+def test_an_attitude_is_proved_by_more_than_its_own_three_pairs(matched):
+    """Sixty stars on a grid, of which some have a source and the others one 20 px aside: by how
+    probable it is that so many more of 57 have one by chance.
+    """
+    x_px, y_px = np.meshgrid(np.linspace(-290, 290, 10), np.linspace(-200, 200, 6))
+    stars_px = np.column_stack([x_px.ravel(), y_px.ravel()])
+    sources_px = stars_px.copy()
+    sources_px[matched:, 0] += 20.0
+    cam = np.column_stack([stars_px / FOCAL_PX, np.ones(60)])
+    cam /= np.linalg.norm(cam, axis=1, keepdims=True)
+    turn = rotation_of(*POINTINGS_DEG[0])
+    proof = _Proof(SourceField(sources_px, WIDE_PX, HIGH_PX), cam @ turn)
+    # circles of 0.006 diagonals of 800 px
+    chance = 60 * np.pi * 4.8**2 / (WIDE_PX * HIGH_PX)
+    is_proved = binom.sf(matched - 4, 57, chance) <= MAX_CHANCE
+    three = np.array([0, 4, 11])
+    solution = proof.of(three, three, FOCAL_PX)
+    assert (solution is not None) is bool(is_proved)
+    if solution is not None:
+        assert np.sort(solution.star).tolist() == list(range(matched))
+        assert solution.source.tolist() == solution.star.tolist()
+        assert to_matrix(solution.q_icrs_to_cam) == pytest.approx(turn, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("lift_arcsec", "is_nearer", "is_taken"),
+    [(0.0, False, False), (13.6, True, False), (58.3, True, True)],
+)
+def test_refraction_is_taken_where_it_foretells_places_better_by_a_gain(
+    rng, lift_arcsec, is_nearer, is_taken
+):
+    """A camera whose zenith is 56 degrees from its boresight, its places by so much of the air's 58.3
+    arcsec: with a fourth of it a whole one is nearer by less than a hundredth.
+    """
+    zenith = np.array([1.2, 0.9, 1.0]) / np.linalg.norm([1.2, 0.9, 1.0])
+    across = rng.uniform([-0.3, -0.2], [0.3, 0.2], (60, 2))
+    cam = np.column_stack([across, np.ones(60)])
+    cam /= np.linalg.norm(cam, axis=1, keepdims=True)
+    bent = cam + lift_arcsec * ARCSEC * (zenith / (cam @ zenith)[:, None] - cam)
+    x_px, y_px = (np.array(CENTRE_PX) + FOCAL_PX * bent[:, :2] / bent[:, 2:]).T
+    turn = rotation_of(*POINTINGS_DEG[0])
+    places = Places(x_px, y_px, np.full(60, NOISE_PX), cam @ turn)
+    camera = Camera(SIZE_PX, FOCAL_PX, CENTRE_PX, np.eye(3))
+    fit = fit_camera(camera, [Pointing(from_matrix(turn))], [places], fixed=True, last=True)
+    plain_px, bent_px = fit.held_out_px["fixed"], fit.held_out_px["fixed, refraction"]
+    assert (bent_px < plain_px) is is_nearer
+    assert (bent_px < GAIN * plain_px) is is_taken
+    assert fit.model == ("fixed, refraction" if is_taken else "fixed")
+    assert (fit.pointings[0].zenith is not None) is is_taken
 
 
 def test_a_hypothesis_is_given_up_after_so_many_candidates(rng, monkeypatch):

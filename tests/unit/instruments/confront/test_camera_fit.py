@@ -167,8 +167,11 @@ def test_errors_of_a_scale_and_a_distortion_are_those_of_radial_least_squares() 
     assert covariance == pytest.approx(wanted, rel=2e-3)
 
 
-def test_numbers_have_the_smallest_huber_loss() -> None:
-    """Against SciPy's, of a line through points of which a third are outliers to one side."""
+@pytest.mark.parametrize("is_near", [False, True])
+def test_numbers_have_the_smallest_huber_loss(is_near: bool) -> None:
+    """Against SciPy's, of a line through points of which a third are outliers to one side: from
+    nothing, and from where the sum of squares is smallest.
+    """
     rng = np.random.default_rng(6)
     x = np.linspace(-1, 1, 60)
     y = 3 + 2 * x + rng.standard_normal(60) + 6 * (rng.uniform(size=60) < 0.35)
@@ -177,7 +180,10 @@ def test_numbers_have_the_smallest_huber_loss() -> None:
     def residuals(numbers: np.ndarray) -> np.ndarray:
         return np.asarray(design @ numbers - y)
 
-    numbers, normal = minimised(residuals, lambda numbers, off: design, np.zeros(2), 1e-12)
+    start = np.zeros(2)
+    if is_near:
+        start = np.linalg.lstsq(design, y, rcond=None)[0]
+    numbers, normal = minimised(residuals, lambda numbers, off: design, start, 1e-12)
     reference = least_squares(residuals, np.zeros(2), loss="huber", f_scale=HUBER, xtol=1e-12)
     assert numbers == pytest.approx(reference.x, abs=1e-3)
     weight = np.minimum(1, HUBER / np.abs(residuals(numbers)))

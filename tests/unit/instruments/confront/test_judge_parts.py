@@ -21,6 +21,7 @@ from hilstar.instruments.confront.judge import (
     _dim_regions,
     _Explanation,
     _judged_cell,
+    _star_row,
     background_of,
     boresights_moved_px,
     chi2_of,
@@ -154,6 +155,42 @@ def row_at(x_px: float, y_px: float, off_mag: float, **changes: Any) -> StarRow:
     """A star of 1000 DN that is too faint by so much."""
     light = {"dn": 1000 * 10 ** (-0.4 * off_mag), "dn_predicted": 1000.0, "sigma_dn": 1.0}
     return a_star("", 1, 4.0, (x_px, y_px), **(light | changes))
+
+
+def test_a_star_s_row_has_what_was_measured_beside_what_the_catalogue_foretells():
+    """Of the third expected star, which is the second row of a catalogue in another order."""
+    columns = {
+        "hip": np.array([71, 72, 73, 74], dtype=np.int32),
+        "v_mag": np.array([1.5, 2.5, 3.5, 4.5]),
+        "bv_mag": np.array([0.1, 0.2, 0.3, 0.4]),
+        "ra_deg": np.zeros(4),
+        "dec_deg": np.zeros(4),
+    }
+    order = np.array([3, 0, 1, 2])
+    sky = DatedSky(plain_catalog("HIP", 4, columns), 2020.0, None, np.zeros((4, 3)), order)
+    stars = Expected(
+        star=np.array([0, 1, 2, 3]),
+        x_px=np.array([10.0, 20.0, 30.0, 40.0]),
+        y_px=np.array([11.0, 21.0, 31.0, 41.0]),
+        dn=np.array([100.0, 200.0, 300.0, 400.0]),
+    )
+    shot = replace(a_shot(0), sky=sky)
+    seen = _star_row(shot, stars, 2, np.array([30.5, 30.25, 280.0, 7.0]), ("double",))
+    assert seen == StarRow(
+        star=2,
+        hip=72,
+        name="HIP 72",
+        x_px=30.5,
+        y_px=30.25,
+        x_predicted_px=30.0,
+        y_predicted_px=31.0,
+        dn=280.0,
+        sigma_dn=7.0,
+        dn_predicted=300.0,
+        v_mag=2.5,
+        b_v_mag=0.2,
+        flags=("double",),
+    )
 
 
 def missing_at(x_px: float, y_px: float) -> StarRow:

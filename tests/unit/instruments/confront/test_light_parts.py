@@ -17,6 +17,8 @@ from hilstar.instruments.confront.excess import (
     Part,
     _blends,
     _by_law,
+    _light,
+    _places,
     _response,
     _rest,
     _scintillation,
@@ -42,6 +44,7 @@ from hilstar.instruments.confront.light import (
     with_extinction,
 )
 from hilstar.instruments.confront.star_psf import StarPsf
+from hilstar.sky.catalog import plain_catalog
 from tests.support.confrontations import (
     a_session,
     a_shot,
@@ -318,6 +321,73 @@ def test_known_variables_and_doubles_are_told_by_what_the_others_scatter():
     assert "with 2 known variables and doubles" in part.how
     # too few steady ones tell nothing
     assert _variables(sightings(rows[6:])).rms == 0.0
+
+
+STARS = 64  # of a photograph whose scatter is told apart
+
+
+def scattered(off_px: np.ndarray, off_mag: np.ndarray, bv_mag: np.ndarray) -> _Sightings:
+    """Stars of one photograph, so far off, by 0.1 and 0.3 px and by 1 and 3 % of their light, at
+    places of all phases of a pixel in both axes.
+    """
+    number = np.arange(STARS)
+    x_px = 5.0 + 9 * (number % 8) + number % 8 / 8
+    y_px = 4.0 + 6 * (number // 8) + number // 8 / 8
+    columns = {name: np.zeros(STARS) for name in ("v_mag", "ra_deg", "dec_deg")}
+    catalog = plain_catalog("HIP", STARS, {"bv_mag": bv_mag, **columns})
+    shot = seen_shot(np.column_stack([x_px, y_px]), number.tolist())
+    shot.sky = replace(shot.sky, catalog=catalog, order=number)
+    shot.found.sigma_px[:] = np.where(number % 2, 0.3, 0.1)
+    rows = []
+    for k in number:
+        made = row(
+            int(k),
+            off_mag[k],
+            x_px=x_px[k],
+            y_px=y_px[k],
+            x_predicted_px=x_px[k] - off_px[k, 0],
+            y_predicted_px=y_px[k] - off_px[k, 1],
+            b_v_mag=bv_mag[k],
+        )
+        rows.append(replace(made, sigma_dn=made.dn * (0.03 if k % 2 else 0.01)))
+    return sightings(rows, [a_verdict(shot, 0)] * STARS)
+
+
+def test_places_are_off_by_noise_and_by_what_repeats_in_a_pixel_along_either_axis():
+    """By a wave of 0.2 px along x and one of 0.1 px along y, an axis: the rest is in no part."""
+    phases = 2 * np.pi * np.array([np.arange(STARS) % 8, np.arange(STARS) // 8]) / 8
+    off_px = np.column_stack([0.2 * np.cos(phases[0]), 0.1 * np.sin(phases[1])])
+    stars = scattered(off_px, np.zeros(STARS), np.zeros(STARS))
+    session = a_session()
+    parts = {part.name: part.rms for part in _places(session, stars)}
+    wave_ms = (0.2**2 / 2 + 0.1**2 / 2) / 2
+    response_px = _response(session)[1]
+    assert parts == {
+        "photon and background noise": pytest.approx(math.sqrt((0.1**2 + 0.3**2) / 2)),
+        "place within the pixel": pytest.approx(math.sqrt(wave_ms)),
+        "pixel response": response_px,
+        "colour": 0.0,
+        "unexplained": 0.0,
+    }
+
+
+@pytest.mark.parametrize("name", ["colour", "flat field", "place within the pixel"])
+def test_light_is_off_by_noise_and_by_what_goes_with_one_thing_alone(name):
+    """A curve of B-V, a slope over the field, or a wave in a pixel: a part of the scatter that is
+    that of the whole, and noise in magnitudes.
+    """
+    number = np.arange(STARS)
+    bv_mag = 0.2 + 0.1 * (number * 5 % 16)
+    off_mag = {
+        "colour": 0.1 * bv_mag - 0.2 * bv_mag**2,
+        "flat field": 0.02 * (number // 8) - 0.01 * (number % 8),
+        "place within the pixel": 0.1 * np.cos(2 * np.pi * (number % 8) / 8),
+    }[name]
+    stars = scattered(np.zeros((STARS, 2)), off_mag, bv_mag)
+    parts = {part.name: part.rms for part in _light(a_session(), stars)}
+    assert parts[name] == pytest.approx(np.std(off_mag), rel=1e-6)
+    noise = MAG_A_RELATIVE * math.sqrt((0.01**2 + 0.03**2) / 2)
+    assert parts["photon and background noise"] == pytest.approx(noise)
 
 
 def test_blends_are_other_stars_by_how_far_they_lie_within_a_profile():

@@ -22,6 +22,7 @@ from hilstar.instruments.confront.measured_bench import (
     write_tracker,
 )
 from hilstar.instruments.confront.photon_transfer import PixelFit
+from hilstar.instruments.confront.run import _judged_by
 from hilstar.instruments.confront.star_psf import StarPsf
 from hilstar.optics.camera import Camera, Lens
 from tests.support.confrontations import a_session, a_shot
@@ -140,6 +141,32 @@ def test_steps_of_several_dn_are_noise_to_a_detector_of_steps_of_one(tmp_path):
 def test_a_gain_that_nobody_told_is_no_key(tmp_path, line, is_written):
     _, tables = written(tmp_path, GIVEN + line, pixels=replace(PIXELS, gain_told=False))
     assert ("gain_e_per_dn" in tables["tracker"]["detector"]) == is_written
+
+
+@pytest.mark.parametrize(
+    ("fixed", "with_screen", "is_own"),
+    [(True, True, True), (True, False, False), (False, True, False), (False, False, False)],
+)
+def test_a_fixed_camera_before_a_screen_alone_is_judged_by_its_own_file(
+    tmp_path, fixed, with_screen, is_own
+):
+    session, has_screen = session_of(tmp_path, GIVEN + SCREEN * with_screen, fixed=fixed)
+    bench, output = tmp_path / "given" / "bench.toml", tmp_path / "out"
+    output.mkdir()
+    tracker, names = _judged_by(bench, output, session, has_screen=has_screen)
+    assert tracker == (bench if is_own else output / "tracker.toml")
+    tables = ("index.html", "stars.csv", "sources.csv")
+    assert names[:3] == tables
+    assert sorted(path.name for path in output.iterdir()) == sorted(names[3:])
+    assert (names == tables) is is_own
+
+
+@pytest.mark.parametrize(("power", "words"), [(1.0, ""), (0.8, "to the power 1.2500.")])
+def test_levels_that_were_made_linear_are_told_by_the_power_that_did_it(tmp_path, power, words):
+    """A file's levels are a power of the light: the way back is its inverse."""
+    text = written(tmp_path, power=power)[0].read_text()
+    assert ("made linear" in text) is bool(words)
+    assert words in text
 
 
 def table_of(path):

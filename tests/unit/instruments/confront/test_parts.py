@@ -53,6 +53,7 @@ PSF = StarPsf(
 # By central differences of 1e-5: their own error is 1e-10 of the function and 1e-11 by rounding.
 STEP, SLOPE_ERROR = 1e-5, 1e-8
 GAIN = 0.8
+NO_GAUSSIAN = 0.01  # one of 1 px of sigma over a pixel, and cut by a stamp of 11
 FWHM_STEP_PX = 0.01  # of the radii at which a PSF's light is looked at
 MAG_A_RELATIVE = 2.5 / math.log(10)
 
@@ -128,6 +129,14 @@ def test_stars_are_measured_where_they_stand_with_their_light_over_any_level():
     # quadrature in a pixel is right to 1e-3 of its light
     assert measured.places_px == pytest.approx(places_px, abs=2e-3)
     assert measured.dn == pytest.approx(flux_dn, rel=2e-3)
+    # Winick 1986, in so much even noise that stars add none
+    noise_dn = 1e4
+    even = replace(stamps, variance=np.full_like(stamps.variance, noise_dn**2))
+    sigma_px = measure(even, psf, *start_px.T, GAIN).sigma_px
+    wide2_px2 = np.array([sigma_x**2, sigma_y**2]) + 1 / 12
+    axis_px = noise_dn * np.sqrt(8 * np.pi * wide2_px2 * np.sqrt(wide2_px2.prod()))
+    one_axis_px = np.sqrt((axis_px**2).mean()) / flux_dn
+    assert sigma_px == pytest.approx(one_axis_px, rel=NO_GAUSSIAN)
     # centres of gravity of 5 x 5 pixels lose what lies beyond: they start within a third of a pixel
     assert np.column_stack(_middles(stamps)) == pytest.approx(places_px, abs=0.34)
 

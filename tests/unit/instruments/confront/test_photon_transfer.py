@@ -5,11 +5,17 @@ rest of the noise the pixels'.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from hilstar.instruments.confront.background import FixedPattern, fixed_pattern, sky_level
+from hilstar.instruments.confront.background import (
+    FixedPattern,
+    SkyLevel,
+    fixed_pattern,
+    sky_level,
+)
 from hilstar.instruments.confront.photon_transfer import (
     PixelFit,
     _median_error,
@@ -17,8 +23,10 @@ from hilstar.instruments.confront.photon_transfer import (
     fit_pixels,
     transfer_points,
 )
+from hilstar.instruments.confront.session import _pixels
 from hilstar.tracker.settings import DetectorSettings
 from tests.support.claims import holds
+from tests.support.confrontations import a_shot
 
 GAIN, PRNU, READ_E = 17.0, 0.03, 2.0  # the Rosetta NAVCAM of the thesis
 SKY_E = 28_000.0
@@ -46,6 +54,24 @@ def fitted_transfer(images, bench=BENCH):
         (dn - level, level, ~EVERY) for dn, level in zip(images, levels, strict=True)
     )
     return fit_pixels(np.concatenate(points), 1.0, None, bench, pattern or FixedPattern())
+
+
+def test_one_photograph_s_response_is_beside_its_own_exposure_s_dark_counts(rng):
+    """400 DN of light at 4 e- a DN, 8 e- of read noise, offsets of 30 e- and of 80 e- a second in
+    half a second, and a response of 4 %: each pixel's variances add up.
+    """
+    settings = {"gain_e_per_dn": 4.0, "read_noise_e": 8.0, "offset_dn": 60.0}
+    assumed = DetectorSettings(**settings, dsnu_e=30.0, dsnu_e_per_s=80.0)
+    variance_dn2 = 400 / 4 + 2**2 + (30**2 + 40**2) / 4**2 + (0.04 * 400) ** 2 + 1 / 12
+    dn = 460.0 + math.sqrt(variance_dn2) * rng.standard_normal((240, 320))
+    noise_dn = np.full_like(dn, math.sqrt(variance_dn2))
+    level = SkyLevel(np.full_like(dn, 460.0), noise_dn, 16)
+    shot = a_shot(0)
+    shot = replace(shot, photo=replace(shot.photo, dn=dn, exposure_s=0.5), level=level)
+    pixels = _pixels([shot], assumed)
+    assert pixels.gain_e_per_dn == 4.0
+    # of a variance of 516 DN^2 by 76 800 pixels the response is 256: five standard deviations
+    assert pixels.pattern.rms[0] == pytest.approx(0.04, rel=5 * 516 / 256 / math.sqrt(2 * dn.size))
 
 
 @pytest.mark.parametrize("ramp_e", [0.0, 12_000.0])

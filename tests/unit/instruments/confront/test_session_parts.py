@@ -335,6 +335,7 @@ def sources_of(
     ("sources", "words"),
     [
         (sources_of(3.0, 2.0, 15), "trails of about 80 px"),
+        (sources_of(3.0, 2.0, MIN_MATCHED), "trails of about 80 px"),
         (sources_of(17.0, 4.0, 0), "trails of about 17 px"),
         (sources_of(40.0, 38.0, 0, 39.0), "sources are 39 px wide"),
         (sources_of(3.0, 2.0, 0), "no part of the sky fits them at 11.4 deg of width"),

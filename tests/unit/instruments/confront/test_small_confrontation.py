@@ -5,6 +5,7 @@ another renderer planted is what the camera, the prediction and the tables say.
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from hilstar.basics.rotation import conjugate, rotate, to_matrix
 from hilstar.instruments.confront import page
 from hilstar.instruments.confront import run as confront_run
 from hilstar.instruments.confront import session as sessions
-from hilstar.instruments.confront.background import source_mask
+from hilstar.instruments.confront.background import KERNEL_PX, source_mask
 from hilstar.instruments.confront.judge import MASK_PX, Verdict
 from hilstar.instruments.confront.page import Pictures
 from hilstar.instruments.confront.report import Confronted
@@ -50,6 +51,8 @@ CAMERA = Planted(hot=((100, 200), (300, 50)), pedestal_dn=0.0, epoch_jyear=2020.
 FALSE_STAR = (60.3, 120.2, 20000.0)
 # of two photographs of 25 stars each, with shot noise: what the fits know
 WITHIN_PX, WITHIN_MAG = 0.1, 0.05
+# a seventh of the light is beyond a Gaussian of the middle: in wings, and by a PSF that widens
+WIDER_MAG = 0.3
 ABERRATION_RAD = np.radians(25 / 3600)  # which the renderer leaves out
 
 
@@ -282,6 +285,21 @@ def test_sources_are_written_at_their_places_with_their_light(night: Night) -> N
         seen_sources = np.column_stack([shot.sources.places_px, shot.sources.snr])
         # three and two decimals
         assert np.array(written) == pytest.approx(seen_sources, abs=0.0051)
+
+
+def test_fainter_stars_are_seen_down_to_a_signal_of_eight(night: Night) -> None:
+    """Of a Gaussian as wide as the PSF, smoothed by one of a pixel, in even noise."""
+    session = night.session
+    middle = np.array([WIDTH / 2]), np.array([HEIGHT / 2])
+    psf_px = float(session.psf.fwhm_px(*middle)[0]) / 2.3548
+    for verdict in night.found.verdicts:
+        shot = verdict.shot
+        noise_dn = float(np.median(shot.level.noise))
+        faintest_dn = 8.0 * noise_dn * (psf_px**2 + KERNEL_PX**2) / KERNEL_PX * math.sqrt(math.pi)
+        v_mag = shot.sky.v_mag[shot.star[shot.clean]]
+        zero_mag = float(np.median(v_mag + 2.5 * np.log10(shot.found.dn[shot.clean])))
+        reached_mag = zero_mag - 2.5 * math.log10(faintest_dn)
+        assert verdict.fainter.reached_v_mag == pytest.approx(reached_mag, abs=WIDER_MAG)
 
 
 def test_the_page_and_the_tracker_file_are_written_beside_the_tables(night: Night) -> None:

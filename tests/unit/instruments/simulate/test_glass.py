@@ -21,7 +21,7 @@ from hilstar.instruments.campaign.solvers import CENTROIDS, choose_solver
 from hilstar.instruments.campaign.tally import attitude_error_arcsec
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.instruments.simulate.exposures import faulty_exposure
-from hilstar.instruments.simulate.glass import told_psf
+from hilstar.instruments.simulate.glass import _in_glass_square, told_psf
 from hilstar.instruments.simulate.optics import TwinOptics
 from hilstar.instruments.simulate.simulator import Simulator
 from hilstar.optics.camera import Lens
@@ -242,6 +242,36 @@ def test_a_bench_takes_distortion_and_transmission_of_its_glass_where_it_has_non
     assert bench_optics(own.config.tracker, own.folder).transmission(np.array([550.0]))[0] == 0.7
     assert "px from that of [tracker] distortion, which is taken" in caplog.text
     assert "its transmission is not used" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("star_px", "middle"), [(20.0, 20), (20.4, 20), (20.6, 21), (20.5, 21), (19.5, 20)]
+)
+def test_a_glass_s_square_is_about_the_pixel_whose_half_sides_hold_the_star(star_px, middle):
+    """Of five pixels, the first of which is 1 in a square that is padded by dark: 0 and 6."""
+    pixels = np.array([np.arange(15, 27), np.arange(35, 47)])
+    squares = _in_glass_square(pixels, np.array([star_px, star_px + 20.0]), 5)
+    first = middle - 2
+    wanted = [min(max(pixel - first + 1, 0), 6) for pixel in range(15, 27)]
+    assert squares.tolist() == [wanted, wanted]
+    assert wanted.count(3) == 1
+
+
+def test_a_told_glass_is_what_is_drawn_about_a_pixel_at_each_star_s_place(glass_file):
+    """Four stars in two corners and near the middle of a field that is not symmetric, each in the
+    square about a pixel that may be beside the nearest.
+    """
+    file = glass_file()
+    glass = tracker_psf(file.config.tracker, file.folder)
+    x_px, y_px = np.array([[30.2, 60.4, 200.6, 225.3], [170.7, 40.1, 90.8, 215.9]])
+    rows, columns = np.rint(y_px + 0.3).astype(int), np.rint(x_px - 0.3).astype(int)
+    told = told_psf(glass, (rows, columns), 13)(x_px - columns, y_px - rows)
+    drawn = glass.image(x_px, y_px, glass.mean_shares, np.ones(4), (SIDE_PX, SIDE_PX))
+    for square, row, column in zip(told, rows, columns, strict=True):
+        about = drawn[row - 6 : row + 7, column - 6 : column + 7]
+        # drawn in float32
+        assert square == pytest.approx(about, abs=1e-6)
+        assert square.sum() > 0.9
 
 
 def test_what_the_file_does_not_cover_is_said(glass_file, caplog):

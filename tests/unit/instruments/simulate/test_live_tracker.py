@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from hilstar.attitude.wire import protocol
 from hilstar.attitude.wire.packet import AnswerPacket, decode, encode
@@ -37,6 +38,7 @@ from hilstar.instruments.simulate.live_exposure import (
 )
 from hilstar.instruments.simulate.tracker_process import OwnClock, Planted, PlantedErrors
 from hilstar.server.answers.answer import Answer, ReportedStar
+from hilstar.server.bench.build import open_bench
 from hilstar.tracker.identify import MIN_STARS, FoundStars, Identified
 from tests.support.bench_files import filed_bench
 from tests.support.refusals import refusal
@@ -263,6 +265,56 @@ def test_the_brightest_stars_are_reported_in_dn_with_what_is_known(live):
     live.adjust(0.05, 20.0)
     assert live.reported_stars(solved)[0].dn == pytest.approx(500.0)
     live.adjust(0.05, 0.0)
+
+
+@pytest.mark.parametrize(("gain_db", "e_per_dn"), [(0.0, 2.0), (20.0, 0.2)])
+def test_a_star_s_light_is_its_dn_by_the_gain_that_a_client_set(
+    live, gain_db, e_per_dn, monkeypatch
+):
+    """A Gaussian of the PSF, integrated over pixels, of 20 000 DN above an even level."""
+    sigma_px = np.array(live.canvas.psf.sigma_px)
+    steps = (np.arange(65) - 0.5 - 30.3, np.arange(49) - 0.5 - 20.8)
+    across, down = (
+        np.diff(ndtr(step / sigma)) for step, sigma in zip(steps, sigma_px, strict=True)
+    )
+    dn = np.rint(1100 + 20_000 * np.outer(down, across)).astype(np.uint16)
+    monkeypatch.setattr(live, "_last", None)
+    live.adjust(0.05, gain_db)
+    try:
+        found = live.solve(solved_at(0, IDENTITY).exposed, dn).found
+    finally:
+        live.adjust(0.05, 0.0)
+    assert (found.x_px[0], found.y_px[0]) == pytest.approx((30.3, 20.8), abs=0.02)
+    # what of a star is beyond its window
+    assert found.flux_e[0] == pytest.approx(20_000 * e_per_dn, rel=0.02)
+
+
+SMALL = {"tracker": {"aperture_mm": 1.5}, "render": {"quantisation": "round"}}
+
+
+@pytest.mark.parametrize(("bits", "read_noise_e"), [(2, 2.0), (8, 100.0)])
+def test_stars_are_expected_that_the_display_shows_and_the_noise_leaves(
+    tmp_path, bits, read_noise_e
+):
+    """Of a screen of three steps, or of read noise: three sigmas of it in the brightest pixel."""
+    tables = {"monitor": {"bits": bits}, "tracker.detector": {"read_noise_e": read_noise_e}}
+    file = filed_bench(tmp_path, GLOWING, SMALL, tables)
+    with open_bench(file) as bench:
+        rates_e_per_s = bench.stars.electrons_per_s
+        shown_e_per_s = bench.faintest_shown_e_per_s
+    with LiveTracker(file, np.random.default_rng(1)) as tracker:
+        kept_e_per_s = tracker.stars.electrons_per_s
+        peak_share = tracker.canvas.psf.peak_share
+    # a step of the codes, of a twelfth of 2 e- squared, is the least of it
+    noise_e = np.hypot(read_noise_e, 2.0 / np.sqrt(12))
+    detected_e_per_s = 3 * noise_e / peak_share / 0.05
+    limit_e_per_s = max(shown_e_per_s, detected_e_per_s)
+    assert limit_e_per_s > 1.5 * min(shown_e_per_s, detected_e_per_s)
+    assert rates_e_per_s.min() < limit_e_per_s < rates_e_per_s.max()
+    # a black screen glows by a thousandth of the noise
+    margin_e_per_s = 1e-3 * limit_e_per_s
+    assert kept_e_per_s.min() >= limit_e_per_s - margin_e_per_s
+    assert len(kept_e_per_s) >= (rates_e_per_s > limit_e_per_s + margin_e_per_s).sum()
 
 
 def test_an_uneven_dark_grows_with_the_client_s_exposure_and_gain(live, monkeypatch):

@@ -787,6 +787,35 @@ def test_a_mosaic_s_star_has_the_light_of_its_own_channels_before_each_colour_s_
     assert dark[1].tolist() == [0.0, 0.0, 0.0]
 
 
+def test_each_channel_of_a_mosaic_has_its_own_light_sky_and_noise(tmp_path):
+    """Red 50, green the mean of 20 and 24, blue 5, of a mean of 24.75; the squares of the channels'
+    S/N add up to that of the whole.
+    """
+    nm = np.arange(400.0, 721.0, 20.0)
+    curves = {"r": bump(620.0, 60, nm), "g": bump(540.0, 60, nm), "b": 0.5 * bump(460.0, 60, nm)}
+    keys = write_channels(tmp_path, nm, curves)
+    changes = {"tracker": keys, "tracker.detector": {"bayer": "grbg"}}
+    file = filed_bench(tmp_path, changes, {"tracker": {"psf_sigma_px": [1.0, 1.0]}})
+    sky_e = np.tile([[20.0, 50.0], [5.0, 24.0]], (4, 6))
+    star = noisy_star(file, sky_e)
+    star_e, background_e = np.array([1e4, 1e3, 10.0]), np.full(3, 24.75)
+    finder = CentroidSettings()
+    rows = star.noise(star_e, background_e, finder)
+    shown = slice(0, 2)
+    table = (np.arange(3.0), star_e, background_e, rows, shown, np.zeros((2, 2)))
+    coloured = noise._ByMagnitude(star, *table)
+    snr_columns, channels = noise._by_channel(file, sky_e, coloured, finder)
+    assert list(snr_columns) == ["snr_r", "snr_g", "snr_b"]
+    squares = sum(snr**2 for snr in snr_columns.values())
+    assert squares == pytest.approx(rows["snr"][shown] ** 2, rel=0.02)
+    shares = dict(zip("rgb", star.mosaic[0], strict=True))
+    assert {name: one["star_share"] for name, one in channels.items()} == pytest.approx(shares)
+    sky = {name: one["background_e_per_px"] for name, one in channels.items()}
+    assert sky == pytest.approx({"r": 50.0, "g": 22.0, "b": 5.0})
+    grey = noise._ByMagnitude(gaussian(1.0), *table)
+    assert noise._by_channel(file, sky_e, grey, finder) == ({}, {})
+
+
 def test_fields_all_over_the_sky_are_identified_by_four_stars_and_more(tmp_path, monkeypatch):
     """Of a pinhole's stars to V = 5, which are all found for sure."""
     fields = 16

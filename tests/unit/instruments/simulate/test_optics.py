@@ -158,6 +158,36 @@ def test_the_glow_of_a_small_screen_is_not_diluted_by_the_detector_around_it(geo
     assert on_screen_median(np.zeros((3, 3))) == 0
 
 
+@pytest.mark.parametrize("turn_deg", [0.0, 30.0, 80.0, -150.0])
+def test_a_glow_is_as_dense_however_the_screen_is_turned(geometry, turn_deg):
+    """Of pixels that are wider than high in neither: as many a square pixel as the scale says."""
+    half = math.radians(turn_deg) / 2
+    q_turned = np.array([math.cos(half), 0.0, 0.0, math.sin(half)])
+    turned = replace(geometry, monitor=monitor_camera((160, 160), 57.65, 120.0, q_turned))
+    black = table_response(8, gamma_response(8).light, black=1e-3)
+    with TwinOptics(turned, GaussianPsf(PSF_PX)) as optics:
+        glow = optics.glow_e_per_s(Panel(black, 1e6))
+    scale = (57.65e-3 / 120) / (13e-3 / 25)
+    assert glow == pytest.approx(1e3 / scale**2, rel=1e-9)
+
+
+def test_a_glow_is_as_uneven_as_the_panel_at_the_pixel_that_is_seen(geometry, rng):
+    """A screen of 28 x 32 px, each of which is two of the tracker's: beside it there is no light, and
+    below it there is no detector.
+    """
+    screen = monitor_camera((28, 32), 124.8, 120.0, np.array([1.0, 0.0, 0.0, 0.0]))
+    uneven = rng.uniform(0.5, 1.0, (32, 28))
+    black = table_response(8, gamma_response(8).light, black=1e-3)
+    with TwinOptics(replace(geometry, monitor=screen), GaussianPsf(PSF_PX)) as optics:
+        glow = optics.glow_e_per_s(Panel(black, 1e6, uniformity=uneven))
+    column = np.floor((np.arange(60) - 29.5) / 2 + 14).astype(int)
+    row = np.floor((np.arange(50) - 24.5) / 2 + 16).astype(int)
+    is_seen = (column >= 0) & (column < 28)
+    assert is_seen.sum() == 56
+    assert glow[:, is_seen] == pytest.approx(1e3 / 4 * uneven[row[:, None], column[is_seen]])
+    assert not glow[:, ~is_seen].any()
+
+
 def test_a_glow_beyond_a_lens_is_nothing_and_never_nan(geometry):
     """A tracker that sees far past a screen, whose lens is known as far as its corners."""
     small = monitor_camera((16, 12), 57.65, 120.0, np.array([1.0, 0.0, 0.0, 0.0]))
@@ -182,16 +212,17 @@ def test_a_glow_is_the_same_in_bands_of_rows(geometry, monkeypatch):
     assert np.array_equal(bands, whole)
 
 
-def test_what_a_wide_pixel_beside_the_detector_lights_of_it_is_there(geometry):
-    """A monitor pixel of 9 tracker pixels whose middle is 4 px off the detector, against the
-    integral over its square.
+@pytest.mark.parametrize("beside_px", [(-4.0, 25.0), (63.0, 25.0), (30.0, -4.0), (30.0, 53.0)])
+def test_what_a_wide_pixel_beside_the_detector_lights_of_it_is_there(geometry, beside_px):
+    """A monitor pixel of 9 tracker pixels whose middle is about 4 px off one of the detector's sides,
+    against the integral over its square.
     """
-    wide = replace(
-        geometry, monitor=monitor_camera((64, 48), 576.5, 120.0, np.array([1.0, 0.0, 0.0, 0.0]))
-    )
+    upright = np.array([1.0, 0.0, 0.0, 0.0])
+    screen = monitor_camera((64, 48), 576.5, 120.0, upright, (31.5, 23.0))
+    wide = replace(geometry, monitor=screen)
     x_px, y_px = (part.ravel() for part in np.meshgrid(np.arange(64.0), np.arange(48.0)))
     seen_x, seen_y = wide.to_tracker(x_px, y_px)
-    beside = int(np.argmin(np.hypot(seen_x + 4.0, seen_y - 25.0)))
+    beside = int(np.argmin(np.hypot(seen_x - beside_px[0], seen_y - beside_px[1])))
     light = np.zeros((48, 64))
     light.ravel()[beside] = 1.0
     with TwinOptics(wide, GaussianPsf(PSF_PX)) as optics:

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import label
 
-from hilstar.instruments.simulate.eye_picture import MAX_RADIUS_PX, _discs, exposure_picture
+from hilstar.instruments.simulate.eye_picture import (
+    MAX_RADIUS_PX,
+    _discs,
+    exposure_picture,
+    sky_under,
+)
 
 FULL = 2900  # DN at which every one of these stars is full
 SKY_DN, NOISE_DN = 80, 5
@@ -58,6 +63,15 @@ def test_a_curved_sky_is_no_star(rng):
     picture = picture_of(noisy_frame(rng, [(100, 40, 1500)], body_dn=hill_dn))
     _, count = label(picture > SEEN)
     assert count == 1
+
+
+@pytest.mark.parametrize("size_px", [(272, 288), (288, 272), (150, 203)])
+def test_a_slanted_sky_is_its_own_to_the_corners(size_px):
+    """By blocks of 17 by 18 px, and by some that leave rows and columns over, without noise."""
+    height, width = size_px
+    y, x = np.mgrid[:height, :width]
+    slanted_dn = 1000 + 5 * x - 3 * y
+    assert sky_under(slanted_dn.astype(np.uint16)).level_dn == pytest.approx(slanted_dn, abs=1e-6)
 
 
 @pytest.mark.parametrize("radius_px", [12, 30, 70])

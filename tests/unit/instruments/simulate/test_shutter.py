@@ -32,6 +32,8 @@ from hilstar.tracker.settings import DetectorSettings
 from tests.support.bench_files import filed_bench
 from tests.support.benches import ORION_Q, TWIN, bench_text
 from tests.support.commands import run_hilstar_here
+from tests.support.satellites import element_set
+from tests.support.skies import STATION_TLE, STATION_UTC
 from tests.support.stars import stars_at
 
 IDENTITY = np.array([1.0, 0, 0, 0])
@@ -272,6 +274,41 @@ def test_each_frame_before_a_rolling_shutter_has_the_sky_of_its_own_time(
     assert round(frames[0]) <= -1 and round(frames[-1]) >= 3
     for t_s, (_, shown_q) in zip(since_s, drawn, strict=True):
         assert shown_q == pytest.approx(propagate(q, rate_rad_s, t_s), abs=1e-9)
+
+
+@pytest.mark.parametrize("has_satellites", [False, True])
+def test_a_tracker_at_rest_sees_a_new_picture_of_each_frame_where_satellites_pass(
+    tmp_path, monkeypatch, has_satellites
+):
+    """Before a rolling shutter; a sky without them is drawn once."""
+    drawn_ns = []
+    draw = Bench.draw
+
+    def seen(bench, q, frame, rate_rad_s, t_ns):
+        drawn_ns.append(t_ns)
+        return draw(bench, q, frame, rate_rad_s, t_ns=t_ns)
+
+    monkeypatch.setattr(Bench, "draw", seen)
+    (tmp_path / "station.tle").write_text(STATION_TLE)
+    (tmp_path / "tles.txt").write_text("S\n" + element_set(5, (10.0, 0.0, 0.0, 0.0), 0.001, 14.0))
+    tables = {
+        "tracker": {"resolution_px": [64, 400]},
+        "sky": {"faintest_v_mag": 0.2, "epoch_utc": STATION_UTC},
+        "spacecraft": {"orbit": "station.tle"},
+        "render": {"quantisation": "round"},
+    }
+    if has_satellites:
+        tables["sky.bodies"] = {"satellites": "tles.txt"}
+    display = DisplayTracker(filed_bench(tmp_path, tables, ROLLING))
+    view = View.exposure(np.array(ORION_Q), np.zeros(3), 3 / 60, 7 * NS_PER_S)
+    display.expose(view, None)
+    display.close()
+    if not has_satellites:
+        assert len(drawn_ns) == 1
+        return
+    # rows lie 8 ms before and after the middle one: five frames and those that begin within
+    assert len(drawn_ns) >= 5
+    assert np.diff(drawn_ns) == pytest.approx(NS_PER_S / 60, abs=1)
 
 
 def test_frame_transfer_smears_each_column_by_its_light(tmp_path):

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from astropy.io import fits
 from scipy.special import ndtr
 
 from hilstar.instruments.simulate.star_finder import (
@@ -22,6 +23,7 @@ from hilstar.server.bench.build import open_bench
 from hilstar.tracker.centroiders import FAMILY
 from hilstar.tracker.centroids import Centroids, CentroidSettings, LocalBackground
 from tests.support.bench_files import filed_bench
+from tests.support.psfs import gaussian, sampled
 from tests.support.spectra import write_channels
 
 # Of a star of sigma 1 px in pixels: a window's S-curve, a box's cut wings.
@@ -108,6 +110,40 @@ def test_blobs_begin_at_a_fifth_of_the_faintest_star_s_peak_of_red_in_a_mosaic(
     assert threshold_e == pytest.approx(0.2 * least * peak_e)
     assert finder.background.level == 0.0
     assert finder.centroider == "window" and finder.told is None
+
+
+@pytest.mark.parametrize(
+    ("centroider", "psf", "is_told"),
+    [
+        ("psf", "psf.fits", True),
+        ("psf", "gaussian", False),
+        ("window", "psf.fits", False),
+        ("box3", "gaussian", False),
+    ],
+)
+def test_a_centroider_of_the_psf_is_told_that_of_a_star_as_shown(
+    tmp_path, centroider, psf, is_told
+):
+    """Samples of a Gaussian of 0.8 by 0.6 px before one of 0.9 px of a monitor three times as fine, of
+    two squares; a Gaussian is known by its width.
+    """
+    samples = sampled(gaussian(0.8, 0.6), 5, 5).astype(np.float32)
+    header = fits.Header([("OVERSAMP", 5)])
+    fits.PrimaryHDU(samples, header).writeto(tmp_path / "psf.fits")
+    tables = {
+        "tracker.optics": {"psf": psf},
+        "render": {"sprite_sigma_px": [0.9, 0.9]},
+        "sky": {"faintest_v_mag": 5.0},
+        "verify": {"centroider": centroider},
+    }
+    with open_bench(filed_bench(tmp_path, tables)) as bench:
+        finder = star_finder(bench, 3.0)
+    assert finder.centroider == centroider
+    assert (finder.told is not None) is is_told
+    if finder.told is not None:
+        shown_px2 = (0.9**2 + 2 / 12) / 9
+        wanted_px = np.sqrt(np.array([0.8, 0.6]) ** 2 + shown_px2)
+        assert finder.told.width_px == pytest.approx(wanted_px, rel=0.01)
 
 
 def test_places_are_inside_by_the_margin_of_each_axis():

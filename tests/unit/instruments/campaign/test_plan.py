@@ -51,6 +51,13 @@ def test_a_latin_hypercube_has_one_case_in_each_stratum_and_a_grid_each_node_onc
     assert len({tuple(np.floor(point * [3, 4])) for point in grid}) == 12
 
 
+def test_a_latin_hypercube_that_fills_the_memory_is_refused_before_it_is_made() -> None:
+    """Of four dimensions, 1.6 GB are 50 million cases."""
+    line = refusal(Design, "latin-hypercube", 1, 50_000_001, 3, [1])
+    assert "cases = 50000001: a Latin hypercube is made as a whole, of at most 50000000" in line
+    assert line.endswith('with 4 dimensions; write sampling = "sobol"')
+
+
 def test_a_plan_that_writes_no_more_than_it_must_is_as_its_page_says(tmp_path: Path) -> None:
     """The defaults of the tables of keys of docs/campaign.md."""
     page = Path(__file__).parents[4] / "docs/campaign.md"

@@ -51,10 +51,14 @@ def test_a_latin_hypercube_has_one_case_in_each_stratum_and_a_grid_each_node_onc
     assert len({tuple(np.floor(point * [3, 4])) for point in grid}) == 12
 
 
-def test_a_latin_hypercube_that_fills_the_memory_is_refused_before_it_is_made() -> None:
-    """Of four dimensions, 1.6 GB are 50 million cases."""
-    line = refusal(Design, "latin-hypercube", 1, 50_000_001, 3, [1])
-    assert "cases = 50000001: a Latin hypercube is made as a whole, of at most 50000000" in line
+def test_a_latin_hypercube_beyond_the_values_that_it_may_hold_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of four dimensions 200 values are 50 cases."""
+    monkeypatch.setattr("hilstar.instruments.campaign.plan.MAX_HYPERCUBE_VALUES", 200)
+    assert Design("latin-hypercube", 1, 50, 3, [1]).points(0, 50).shape == (50, 4)
+    line = refusal(Design, "latin-hypercube", 1, 51, 3, [1])
+    assert "cases = 51: a Latin hypercube is made as a whole, of at most 50 cases with 4" in line
     assert line.endswith('with 4 dimensions; write sampling = "sobol"')
 
 

@@ -407,3 +407,18 @@ def test_the_finding_over_frames_is_of_temporal_at_the_frames_of_the_aim(
         " gamma 2.2, 8 bits 0.26 mag, 0.13 px; linear, 8 bits 0.36 mag, 0.18 px; linear, 2 bits"
         " 0.46 mag, 0.23 px; 1 bit 0.56 mag, 0.28 px"
     )
+
+
+@pytest.mark.parametrize("bits", BITS)
+def test_bit_stealing_s_steps_from_black_are_by_the_shares_of_rec_709(bits: int) -> None:
+    """Blue has 7 % of white, red 21 %, green 72 %: by rising light blue, red, both, green."""
+    steals = {way: codes.response_of(bits, way) for way in WAYS}
+    for way, response in steals.items():
+        if not way.stealing:
+            assert response.rgb is None and len(response.light) == 2**bits
+            continue
+        assert response.rgb is not None and len(response.light) == 7 * (2**bits - 1) + 1
+        steps = [[0, 0, 1], [1, 0, 0], [1, 0, 1], [0, 1, 0], [0, 1, 1], [1, 1, 0], [1, 1, 1]]
+        assert response.rgb[1:8].tolist() == steps
+        shares = np.array([0.0722, 0.2126, 0.2848, 0.7152, 0.7874, 0.9278, 1.0])
+        assert response.light[1:8] == pytest.approx(shares * response.light[7])

@@ -471,10 +471,6 @@ def _check_through(plan: Plan, varied: list[Parameter], file: BenchFile) -> None
                 f'[[vary]] key = "{parameter.key}": with a log the motion is the log\'s; leave it'
                 " out"
             )
-        if parameter.key == SCENARIO and not parameter.values:
-            raise InputError(
-                '[[vary]] key = "scenario": is a file; write values = ["faults.toml", ""]'
-            )
         if table == "misalignment_arcsec" and (
             file.config.collimator.geometry or file.config.verify.true_geometry
         ):

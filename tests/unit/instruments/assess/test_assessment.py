@@ -17,12 +17,14 @@ from scipy.spatial.transform import Rotation
 
 from hilstar.basics import charts
 from hilstar.basics.arrays import FloatArray
+from hilstar.basics.units import NS_PER_S
 from hilstar.instruments.assess import report
 from hilstar.instruments.assess.assessment import (
     AssessSettings,
     _glass_notes,
     assess_files,
     lock_of,
+    read_ledger,
 )
 from hilstar.instruments.assess.bench_effects import display_cost, slices_of, turn_between
 from hilstar.instruments.simulate.glass import split_errors
@@ -33,14 +35,15 @@ from hilstar.server.bench.bench_file import bench_file_of
 from hilstar.server.bench.cameras import tracker_camera
 from hilstar.server.bench.star_light import bench_stars
 from hilstar.server.record.commanded import Commanded
-from hilstar.server.record.ledger_records import AnswerRecord
+from hilstar.server.record.ledger_records import AnswerRecord, FrameRecord
 from tests.support.assessments import an_assessment
-from tests.support.benches import bench_text
+from tests.support.benches import SMALL_BENCH, bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.figures import assert_legible
 from tests.support.glass import SIDE_PX, stack
-from tests.support.planted_run import write_ledger, write_run, write_telemetry
+from tests.support.planted_run import write_ledger, write_records, write_run, write_telemetry
 from tests.support.planted_tracker import Planted, Sizes, attitude, plant, scalar_first, scan, still
+from tests.support.refusals import refusal
 
 SIZES = Sizes(wild=5, offset_s=0.02)
 
@@ -324,6 +327,33 @@ def test_a_ledger_without_attitudes_is_refused(tmp_path: Path, planted: Planted)
     ledger = write_ledger(tmp_path / "run.mcap", planted.frames_s[:50], None)
     telemetry = write_telemetry(tmp_path / "telemetry.csv", planted.tau_s, planted.reported)
     check_refused(ledger, telemetry, "none of them has an attitude")
+
+
+def test_a_ledger_that_shows_no_sky_or_no_bench_is_refused_with_what_it_lacks(
+    tmp_path: Path,
+) -> None:
+    """Of frames that an operator changed or a window hid, and of a head without a bench."""
+    q = (1.0, 0.0, 0.0, 0.0)
+    frames = []
+    for number in range(5):
+        at_ns = (number + 1) * NS_PER_S
+        frame = FrameRecord(
+            frame=number, t_ns=at_ns, light_ns=at_ns, draw_ns=at_ns, swap_ns=at_ns, q=q
+        )
+        frames.append(frame)
+    changed = [msgspec.structs.replace(frame, operator="grid") for frame in frames]
+    hidden = [msgspec.structs.replace(frame, hidden="minimised") for frame in frames]
+    none = [msgspec.structs.replace(frame, q=None) for frame in frames]
+    for records, bench, words in (
+        (changed, SMALL_BENCH, "5 frames, and operators' keys or a hidden window changed all of"),
+        (hidden[:4] + frames[4:], SMALL_BENCH, "5 frames, and operators' keys or a hidden window"),
+        (none[:4] + frames[4:], SMALL_BENCH, "5 frames, and none of them has an attitude"),
+        (frames, "no TOML", "its head holds no bench file that can be read; give the ledger of"),
+    ):
+        path = write_records(tmp_path / "run.mcap", records, bench)
+        assert words in refusal(read_ledger, path)
+    whole = read_ledger(write_records(tmp_path / "run.mcap", frames))
+    assert whole.commanded.shown.sum() == 5
 
 
 def test_a_still_run_does_not_invent_a_clock(tmp_path: Path) -> None:

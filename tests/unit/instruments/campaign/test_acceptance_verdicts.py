@@ -4,6 +4,7 @@ and why, and failures over all levels of a sweep. No case is run.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +87,29 @@ def test_a_clause_that_more_cases_would_decide_is_tested_and_one_without_its_col
     assert none.verdict is None
     assert (none.word, none.unit) == ("not tested", "s")
     assert none.untested.startswith("recovery_s: the table has no such column")
+
+
+def test_the_clauses_of_a_set_that_cannot_run_are_not_tested_and_share_no_doubt(
+    tmp_path: Path,
+) -> None:
+    """Of two sets one is refused. The other's clause, which is then the only one that is tested, is
+    not met at 5 % of doubt, and would be open at a third of it.
+    """
+    lows = [clopper_pearson(SILENT, CASES, 1 - 0.05 / part)[0] for part in (1, 3)]
+    text = LOST + "[cases.other]\ncases = 60\n"
+    text += clause("no-attitude", f"maximum = {sum(lows) / 2!r}")
+    text += clause("bias", "maximum = 1.0", "other") + clause(
+        "availability", "minimum = 0", "other"
+    )
+    acceptance = acceptance_of(tmp_path, text)
+    lost, other = acceptance.sets
+    refused = replace(other, refused="no display here")
+    found, *untested = acceptance.verdicts([SetResult(lost, lost_cases()), SetResult(refused)])
+    assert (found.word, found.together) == (NOT_MET, NOT_MET)
+    assert [(each.word, each.verdict, each.untested, each.unit) for each in untested] == [
+        ("not tested", None, "no display here", "arcsec"),
+        ("not tested", None, "no display here", ""),
+    ]
 
 
 @pytest.mark.parametrize("through", ["tracker", "display"])

@@ -51,6 +51,17 @@ def test_a_latin_hypercube_has_one_case_in_each_stratum_and_a_grid_each_node_onc
     assert len({tuple(np.floor(point * [3, 4])) for point in grid}) == 12
 
 
+def test_a_latin_hypercube_beyond_the_values_that_it_may_hold_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of four dimensions 200 values are 50 cases."""
+    monkeypatch.setattr("hilstar.instruments.campaign.plan.MAX_HYPERCUBE_VALUES", 200)
+    assert Design("latin-hypercube", 1, 50, 3, [1]).points(0, 50).shape == (50, 4)
+    line = refusal(Design, "latin-hypercube", 1, 51, 3, [1])
+    assert "cases = 51: a Latin hypercube is made as a whole, of at most 50 cases with 4" in line
+    assert line.endswith('with 4 dimensions; write sampling = "sobol"')
+
+
 def test_a_plan_that_writes_no_more_than_it_must_is_as_its_page_says(tmp_path: Path) -> None:
     """The defaults of the tables of keys of docs/campaign.md."""
     page = Path(__file__).parents[4] / "docs/campaign.md"

@@ -144,6 +144,21 @@ PLANS += [
     (plan_text() + "[centroids]\npsf_focus_um = 5.0\n", 'are for centroider = "psf"'),
 ]
 
+ENDLESS = {"minimum": None, "maximum": None, "values": [0.7]}
+LOG: dict[str, Any] = {"kind": "log", "log": "log.csv"}
+ACCELERATION = {"key": "acceleration_deg_s2.x", "values": [1.0]}
+PLANS += [
+    (looking(log="log.csv"), 'log is for kind = "log", and kind is "all-sky"; write that'),
+    (plan_text(PSF | ENDLESS | {"steps": 3}), "steps and scale are for minimum and maximum; leave"),
+    (plan_text(PSF | ENDLESS | {"scale": "log"}), "steps and scale are for minimum and maximum;"),
+    (plan_text(PSF | {"steps": 3}), 'steps is for sampling = "grid"; leave it out'),
+    (plan_text({"key": "scenario", "values": [3]}), "the value 3; write paths of scenario files"),
+    (plan_text({"key": "scenario", "minimum": 0, "maximum": 1}), "the value 0.0; write paths of"),
+    (plan_text({"key": "scenario", "values": []}), "array. of length >= 1"),
+    (looking({"key": "time_s", "values": [1.0]}, **LOG), "the times are the log's; leave it out"),
+    (looking(ACCELERATION, **LOG), "the motion is the log's; leave it out"),
+]
+
 
 def cases_of(plan: Path) -> CaseMaker:
     """The cases of a plan over its bench."""
@@ -154,5 +169,6 @@ def cases_of(plan: Path) -> CaseMaker:
 def test_what_is_no_plan_is_refused_in_one_line(tmp_path: Path, text: str, words: str) -> None:
     plan = write_campaign(tmp_path)
     plan.write_text(text)
+    (tmp_path / "log.csv").write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n9,1,0,0,0\n")
     line = refusal(cases_of, plan)
     assert re.search(words, line), line

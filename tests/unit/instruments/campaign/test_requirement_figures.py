@@ -362,3 +362,42 @@ def test_of_too_many_cases_some_are_judged_spread_over_all(count, judged, monkey
     verdict = found(cases_of(solved=solved, wrong=np.zeros(count)), "availability", minimum=0.5)
     assert verdict.cases == judged
     assert verdict.value == pytest.approx(1 - 1 / judged)
+
+
+def test_a_figure_that_no_case_tells_says_what_is_missing() -> None:
+    """Frames without an answer, a table without the column, and one right answer a case."""
+    count = 30
+    none, one = np.zeros(count), np.ones(count)
+    silent = cases_of(solved=none, wrong=none)
+    single = cases_of(solved=one, wrong=none, **{f"scatter_{axis}_arcsec": one for axis in "xyz"})
+    for cases, quantity, words in (
+        (silent, "wrong-rate", "there is no answer"),
+        (silent, "time-to-first-attitude", "first_attitude_s: no such column"),
+        (silent, "recovery", "no such column: a plan that varies scenario has"),
+        (single, "nea", "no case has two right answers"),
+    ):
+        verdict = found(cases, quantity, maximum=1.0)
+        assert (verdict.value, verdict.verdict) == (None, NOT_SHOWN)
+        assert words in verdict.words
+
+
+def test_a_scatter_of_few_wild_cases_has_the_limits_of_a_bootstrap(rng) -> None:
+    """Of 60 cases of ten answers three scatter tenfold: its square is 5.95 of 1."""
+    scatter = np.ones(60)
+    scatter[::20] = 10.0
+    columns = {f"scatter_{axis}_arcsec": scatter for axis in "xyz"}
+    cases = cases_of(solved=np.full(60, 10.0), wrong=np.zeros(60), **columns)
+    verdict = found(cases, "nea", maximum=99.0)
+    assert verdict.value == pytest.approx(math.sqrt(5.95))
+    assert "bootstrap, not Gaussian" in verdict.method
+    narrow = sigma_limits(5.95, 60 * 9 * 2.0, 0.95)
+    assert 1.0 <= verdict.low < narrow[0] < verdict.value < narrow[1] < verdict.high
+
+
+@pytest.mark.parametrize(("off", "more"), [(1e-2, 999_900), (2.9e-3, None)])
+def test_more_cases_than_ten_million_are_not_worth_a_figure(off: float, more: int | None) -> None:
+    """An interval of +-1 in 100 cases about a value so far from its limit: 100 / off^2 cases."""
+    figure = BoundedFigure(10.0 - off, 9.0 - off, 11.0 - off, 100, "")
+    verdict = requirements.judged_figure(Require(quantity="bias", maximum=10.0), figure, (0.0, 0.0))
+    assert verdict.verdict == NOT_SHOWN
+    assert verdict.more == (None if more is None else pytest.approx(more, abs=1))

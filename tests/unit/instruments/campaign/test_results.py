@@ -16,9 +16,10 @@ from hilstar.instruments.assess.budget import Axes
 from hilstar.instruments.campaign import results
 from hilstar.instruments.campaign.case_table import Columns, read_cases
 from hilstar.instruments.campaign.results import costs, write_results
-from hilstar.instruments.campaign.store import schema_of, write_table
+from hilstar.instruments.campaign.store import failures, schema_of, write_table
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.campaigns import write_campaign
+from tests.support.refusals import refusal
 
 CASES = 2000
 BIAS_ARCSEC = np.array([5.0, -3.0, 40.0])
@@ -134,6 +135,27 @@ def test_a_large_table_is_read_in_part(tmp_path: Path) -> None:
     # every third: of every second there were more than are asked for
     part = read_cases(tmp_path / "t.parquet", 49)
     assert part.numbers["case"].tolist() == [*range(0, 60, 3), *range(60, 100, 3)]
+
+
+def test_a_table_s_columns_are_numbers_texts_and_lists_by_their_kinds(tmp_path: Path) -> None:
+    """A gap is no number, no text or an empty list."""
+    kinds = {"case": "int64", "why": "text", "times": "floats", "value": "float64"}
+    rows = [
+        {"case": 0, "why": "late", "times": [1.0, 2.0], "value": None},
+        {"case": 1, "why": None, "times": None, "value": 0.5},
+    ]
+    path = tmp_path / "t.parquet"
+    write_table(path, schema_of(kinds, {}), iter([rows[:1], rows[1:]]))
+    columns = read_cases(path)
+    assert columns.texts == {"why": ["late", ""]}
+    assert [values.tolist() for values in columns.lists["times"]] == [[1.0, 2.0], []]
+    assert columns.numbers["case"].tolist() == [0.0, 1.0]
+    assert np.array_equal(columns.numbers["value"], [np.nan, 0.5], equal_nan=True)
+    path.write_text("no table")
+    for read in (read_cases, failures):
+        line = refusal(read, path)
+        assert "t.parquet: is no table of a campaign (" in line
+        assert line.endswith("delete it, and run the same command again")
 
 
 def columns_of(**numbers: list[float]) -> Columns:

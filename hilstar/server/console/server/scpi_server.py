@@ -33,6 +33,8 @@ from hilstar.server.console import scpi
 from hilstar.server.console.messages import (
     FRAME,
     HAS_AGE,
+    MISSING,
+    STALE,
     FrameNumbers,
     Order,
     OrderAnswer,
@@ -124,6 +126,11 @@ class SkySource:
         self._q = sample.q_icrs_to_cam
         self.set_ns = time.monotonic_ns()
         self.send(jumps=True)
+
+    @property
+    def has_attitude(self) -> bool:
+        """Whether an attitude was set: until then nothing is sent, whatever the rate."""
+        return self._q is not None
 
     def rate(self, rate_deg_s: tuple[float, ...]) -> None:
         """Set the rate from now on, deg/s about the camera's axes, (3,). Raises ScpiError if it
@@ -300,6 +307,9 @@ class ScpiServer:
             if newest_frame is None or state is None:
                 return True
             frame = FrameNumbers._make(FRAME.unpack(newest_frame[1]))
+            # The run has not heard of the attitude yet, however late the frame was drawn.
+            if sky.has_attitude and frame.flags & (MISSING | STALE):
+                return True
             # The attitude of a blank or paused frame is not the present one: then the frame's
             # drawing has to be later than the setting.
             follows = frame.flags & HAS_AGE and not state.operator.get("pause")

@@ -21,6 +21,8 @@ from hilstar.server.console.messages import (
     BLANK,
     FRAME,
     HAS_AGE,
+    MISSING,
+    STALE,
     FrameNumbers,
     OrderAnswer,
     RunState,
@@ -296,6 +298,21 @@ def test_a_blank_or_paused_sky_is_set_once_a_frame_is_drawn_after_it(bench, flag
     newest_frame(bench, draw_ns=START_NS - 1, swap_ns=START_NS + NS_PER_MS, flags=flags)
     assert bench.server.pending()
     newest_frame(bench, draw_ns=START_NS, swap_ns=START_NS + 1, age_ns=NS_PER_S, flags=flags)
+    assert not bench.server.pending()
+
+
+@pytest.mark.parametrize("flags", [MISSING | BLANK, STALE | BLANK])
+def test_a_frame_that_was_drawn_before_the_run_heard_of_an_attitude_does_not_show_it(bench, flags):
+    """The frame is begun after the setting, and the setting's packet is still on its way."""
+    bench.run(host_ns=START_NS + NS_PER_S)
+    bench.says("SKY:RATE 0,0,1")
+    newest_frame(bench, draw_ns=START_NS, swap_ns=START_NS + 1, flags=flags)
+    assert not bench.server.pending()  # without an attitude no frame shows a rate
+    bench.now_ns += 1
+    bench.says("SKY:ATT 1,0,0,0")
+    newest_frame(bench, draw_ns=bench.now_ns + 5, swap_ns=bench.now_ns + 6, flags=flags)
+    assert bench.server.pending()
+    newest_frame(bench, draw_ns=bench.now_ns + 7, swap_ns=bench.now_ns + 8)
     assert not bench.server.pending()
 
 

@@ -16,9 +16,10 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
+from msgspec import structs
 
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.attitude.wire.source import Convention, Conventions, Mounting
+from hilstar.attitude.wire.source import HILSTARS, Convention, Conventions, Mounting
 from hilstar.basics.arrays import BoolArray, FloatArray
 from hilstar.basics.rotation import conjugate, multiply, rotate, to_rotation_vector
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
@@ -75,13 +76,11 @@ class ReadAs:
     then by `q_body_to_cam` (4,).
 
     That is None where they are the camera's own. `has_key` says whether the key states how the
-    source is read; a source
-    with a convention of its own refuses it. `stated_by` is what states it: that key, or a command's
-    option.
+    source is read; a source with a convention of its own refuses it. `stated_by` is what states it:
+    that key, or a command's option.
     """
 
-    scalar: str = "first"
-    direction: str = "icrs_to_cam"
+    convention: Convention = HILSTARS
     q_body_to_cam: FloatArray | None = None
     has_key: bool = True
     stated_by: str = KEY
@@ -103,29 +102,21 @@ class ReadAs:
             q_body_to_cam = None
         if not conventions.of_packets:
             return cls(q_body_to_cam=q_body_to_cam, has_key=False)
-        return cls(convention.scalar, convention.direction, q_body_to_cam, stated_by=stated_by)
+        return cls(convention, q_body_to_cam, stated_by=stated_by)
 
     def q_icrs_to_cam(self, sent: FloatArray) -> FloatArray:
         """The camera's attitude (n, 4) by the four numbers that were sent."""
-        q = sent
-        if self.scalar == "last":
-            q = np.roll(q, 1, axis=-1)
-        if self.direction == "cam_to_icrs":
-            q = conjugate(q)
-        if self.q_body_to_cam is not None:
-            q = multiply(self.q_body_to_cam, q)
-        return q
+        q = self.convention.q_icrs_to_frame(sent)
+        if self.q_body_to_cam is None:
+            return q
+        return multiply(self.q_body_to_cam, q)
 
     def sent(self, q_icrs_to_cam: FloatArray) -> FloatArray:
         """The four numbers (n, 4) that were sent for an attitude of the camera."""
         q = q_icrs_to_cam
         if self.q_body_to_cam is not None:
             q = multiply(conjugate(self.q_body_to_cam), q)
-        if self.direction == "cam_to_icrs":
-            q = conjugate(q)
-        if self.scalar == "last":
-            q = np.roll(q, -1, axis=-1)
-        return q
+        return self.convention.as_sent(q)
 
     def advice(self, parts: Sequence[tuple[str, str]]) -> str:
         """What to write for another reading, by its keys and their values."""
@@ -159,14 +150,16 @@ def readings(read_as: ReadAs = AS_PACKETS) -> tuple[Reading, ...]:
     """The other readings of quaternions that are read like this."""
     others = []
     for scalar, direction in itertools.product(("first", "last"), ("icrs_to_cam", "cam_to_icrs")):
-        if (scalar, direction) == (read_as.scalar, read_as.direction):
+        convention = structs.replace(read_as.convention, scalar=scalar, direction=direction)
+        if convention == read_as.convention:
             continue
-        other = replace(read_as, scalar=scalar, direction=direction)
-        others.append(Reading(_words(read_as, other), _advice(read_as, other), read_as, other))
+        other = replace(read_as, convention=convention)
+        text = _words(read_as.convention, convention)
+        others.append(Reading(text, _advice(read_as, convention), read_as, other))
     return tuple(others)
 
 
-def _words(now: ReadAs, other: ReadAs) -> str:
+def _words(now: Convention, other: Convention) -> str:
     words = "quaternions"
     if other.direction != now.direction:
         words = "conjugate of the quaternions"
@@ -175,16 +168,17 @@ def _words(now: ReadAs, other: ReadAs) -> str:
     return words
 
 
-def _advice(now: ReadAs, other: ReadAs) -> str:
+def _advice(read_as: ReadAs, other: Convention) -> str:
     """What to write for another reading; a default that holds now and then need not be written."""
-    parts = []
+    now = read_as.convention
+    parts: list[tuple[str, str]] = []
     if (now.scalar, other.scalar) != ("first", "first"):
         parts.append(("scalar", other.scalar))
     if (now.direction, other.direction) != ("icrs_to_cam", "icrs_to_cam"):
         parts.append(("direction", other.direction))
-    if now.q_body_to_cam is not None:
+    if read_as.q_body_to_cam is not None:
         parts.append(("frame", "body"))
-    return now.advice(parts)
+    return read_as.advice(parts)
 
 
 @dataclass(slots=True)

@@ -60,22 +60,22 @@ class Convention(Table, frozen=True):
         return self.scalar == "first" and self.direction == "icrs_to_cam"
 
     def q_icrs_to_frame(self, sent: FloatArray) -> FloatArray:
-        """The Hamilton quaternion (4,), scalar first, that turns ICRS components into those of
-        `frame`, from a unit quaternion (4,) as it was sent.
+        """The Hamilton quaternions (..., 4), scalar first, that turn ICRS components into those of
+        `frame`, from unit quaternions (..., 4) as they were sent.
         """
         from hilstar.basics.rotation import conjugate
 
         if self.scalar == "first":
             q = sent
         else:
-            q = sent[SCALAR_FROM_LAST]
+            q = sent[..., SCALAR_FROM_LAST]
         if self.direction == "cam_to_icrs":
             return conjugate(q)
         return q
 
     def as_sent(self, q_icrs_to_frame: FloatArray) -> FloatArray:
-        """The quaternion (4,) that a sender with this convention sends for an attitude (4,) of its
-        frame; the inverse of `q_icrs_to_frame`.
+        """The quaternions (..., 4) that a sender with this convention sends for attitudes (..., 4)
+        of its frame; the inverse of `q_icrs_to_frame`.
         """
         from hilstar.basics.rotation import conjugate
 
@@ -83,7 +83,7 @@ class Convention(Table, frozen=True):
             q = conjugate(q_icrs_to_frame)
         else:
             q = q_icrs_to_frame
-        return q if self.scalar == "first" else q[SCALAR_TO_LAST]
+        return q if self.scalar == "first" else q[..., SCALAR_TO_LAST]
 
     def sample(self, sent: AttitudeSample) -> AttitudeSample:
         """The sample with its quaternion turned into q_icrs_to_frame, scalar first; its rate is

@@ -28,6 +28,7 @@ from hilstar.attitude.wire.packet import (
     TimeRequest,
     encode,
 )
+from hilstar.attitude.wire.source import Convention
 from hilstar.basics.notices import Notice, Notices
 from hilstar.basics.process.scheduling import HOST_CLOCK, UNDISCIPLINED_NS, UnixOffset
 from hilstar.basics.rotation import from_radec_roll_deg, propagate
@@ -983,5 +984,5 @@ def test_a_stated_convention_that_the_rates_belie_is_told_against_what_was_sent(
             arrivals.append(Arrival(sample.t_ns + 50_000, sample, encode(sample)))
         return arrivals
 
-    run = ReceiverRun(make, read_as=ReadAs(scalar="last"))
+    run = ReceiverRun(make, read_as=ReadAs(Convention(scalar="last")))
     assert '{ scalar = "first" }' in run.notices.lasting[CONVENTION]

@@ -26,6 +26,7 @@ from hilstar.attitude.clock.rate_causes import (
 )
 from hilstar.attitude.clock.rate_check import RIGHT, WRONG, RateCheck
 from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.attitude.wire.source import Convention
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.notices import Notices
 from hilstar.basics.rotation import (
@@ -437,7 +438,7 @@ def test_a_stated_convention_that_is_wrong_is_told_against_what_was_sent():
     t_ns, q, rates = steady()
     notices, told = Notices(), []
     notices.listen(lambda notice: told.append((notice.kind, notice.detail)))
-    check = RateCheck("use-quaternions", notices, read_as=ReadAs(scalar="last"))
+    check = RateCheck("use-quaternions", notices, read_as=ReadAs(Convention(scalar="last")))
     for sample in samples(t_ns, np.roll(q, 1, axis=1), rates):
         check.see(sample)
     assert [kind for kind, _ in told] == [CONVENTION] and '{ scalar = "first" }' in told[0][1]

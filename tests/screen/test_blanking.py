@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from hilstar.display.window.awake import Awake
 from tests.support.benches import SCREEN_BENCH, still_log
 from tests.support.forks import HILSTAR, Started
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -103,6 +104,30 @@ def test_nothing_blanks_during_a_run_and_all_is_as_before_after_it(server, tmp_p
         if sign != signal.SIGKILL:
             assert blanking_of(server) == BEFORE  # before the command has ended
     wait_for(lambda: blanking_of(server) == BEFORE, "after a kill, within moments")
+
+
+class InterruptedAwake(Awake):
+    """A run that a signal ends while it waits for the first word of the process that prevents
+    blanking, which has done it.
+    """
+
+    server: Xorg
+    is_interrupted = False
+
+    def _word(self) -> bytes:
+        if not self.is_interrupted:
+            self.is_interrupted = True
+            wait_for(lambda: awake(self.server))
+            raise KeyboardInterrupt
+        return super()._word()
+
+
+def test_a_run_that_is_ended_while_blanking_is_set_aside_restores_it(server, monkeypatch):
+    monkeypatch.setenv("DISPLAY", server.display)
+    monkeypatch.setattr(InterruptedAwake, "server", server, raising=False)
+    with pytest.raises(KeyboardInterrupt):
+        InterruptedAwake()
+    assert blanking_of(server) == BEFORE
 
 
 def test_a_kill_of_all_its_processes_restores_too(server, tmp_path):

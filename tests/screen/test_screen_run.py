@@ -129,7 +129,8 @@ def test_the_report_says_it_on_one_page(screen_run, tmp_path):
     ]
     assert sum(data["spans"]["missed"]) == found["missed_frames"]
     # The pictures are the codes that the run showed: replay draws them again from the same ledger.
-    assert len(data["pictures"]) > 8 and not list((tmp_path / "report").glob("*.png"))
+    assert len(data["pictures"]) > min(8, found["frames"] - 1)
+    assert not list((tmp_path / "report").glob("*.png"))
     told = run_hilstar_here("report", ledger, "-o", tmp_path / "report")
     assert "pacing jitter" in told.stdout and "age of the attitude at light" in told.stdout
 

@@ -38,25 +38,30 @@ class Awake:
             stderr=subprocess.DEVNULL,
             start_new_session=True,
         )
-        self._wait()  # GLFW sets a screen saver of its own aside, and must not be the first
+        try:
+            self._word()  # GLFW sets a screen saver of its own aside, and must not be the first
+        except BaseException:  # a signal ends the run while it waits
+            self.close()
+            raise
 
     def close(self) -> None:
         """Restore what was set before. Twice does nothing."""
         if self._process.stdin is None or self._process.stdin.closed:
             return
         self._process.stdin.close()
-        self._wait()
+        while self._word():  # one that nobody has read yet is not the end
+            pass
         if self._process.stdout is not None:
             self._process.stdout.close()
 
-    def _wait(self) -> None:
-        """Wait for the process's word, or its end."""
-        if (
-            self._process.stdout is not None
-            and select.select([self._process.stdout], [], [], MAX_WAIT_S)[0]
-        ):
-            os.read(self._process.stdout.fileno(), 1)
+    def _word(self) -> bytes:
+        """The process's next word; nothing at its end, or where it says none in time."""
+        word = b""
+        stdout = self._process.stdout
+        if stdout is not None and select.select([stdout], [], [], MAX_WAIT_S)[0]:
+            word = os.read(stdout.fileno(), 1)
         self._process.poll()  # the one that was begun ends at once, and leaves the other behind
+        return word
 
 
 class Blanking(NamedTuple):

@@ -3,6 +3,7 @@ to DN.
 """
 
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -135,9 +136,9 @@ class DisplayTracker:
         )
         truth = exposure_truth(self.canvas, view, stars, light, mean_e)
         truth["drawn"] = truth["electrons_per_s"] >= self._bench.faintest_shown_e_per_s
-        return Exposure(
-            view, dn, mean_e, with_errors(truth, stars.catalog, self.config.sky.epoch_jyear)
-        )
+        epoch_jyear = self.config.sky.epoch_jyear
+        errors = partial(with_errors, catalog=stars.catalog, epoch_jyear=epoch_jyear)
+        return Exposure(view, dn, mean_e, truth, errors=errors)
 
     def _light_e_per_s(self, view: View) -> FloatArray:
         """The mean light (primaries, H, W) of the display over the exposure."""

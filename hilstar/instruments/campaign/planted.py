@@ -187,7 +187,7 @@ def aberration_rad(q_icrs_to_cam: FloatArray, velocity_km_s: FloatArray) -> Floa
 
 def lit_stars(exposure: Exposure) -> LitStars:
     """The stars that an exposure has within its detector, without those of faults."""
-    truth = exposure.truth
+    truth = exposure.rows
     height, width = exposure.dn.shape
     with np.errstate(invalid="ignore"):
         off_x = np.abs(truth["x_px"] - (width - 1) / 2)

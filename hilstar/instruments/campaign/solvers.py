@@ -132,7 +132,7 @@ class CentroidSolver:
             window_sigma_px=wanted.window_sigma_px or max(1.0, *width_px),
             psf_sigma_px=width_px if wanted.remove_s_curve else None,
         )
-        truth, (height, width) = exposure.truth, exposure.dn.shape
+        truth, (height, width) = exposure.rows, exposure.dn.shape
         image, background = _image_to_search(exposure, tracker)
         stars = find_stars(image, settings, background)
         with np.errstate(invalid="ignore"):

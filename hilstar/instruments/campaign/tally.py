@@ -128,7 +128,7 @@ class CaseTally:
     def see(self, exposure: Exposure) -> None:
         """Count an exposure."""
         self.frames += 1
-        self.stars_in_view += len(exposure.truth)
+        self.stars_in_view += len(exposure.rows)
         self._digest.update(np.ascontiguousarray(exposure.dn))
 
     def hear(self, exposure: Exposure, answer: SolverAnswer, at_s: float) -> None:

@@ -8,6 +8,7 @@ import itertools
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -36,6 +37,7 @@ from hilstar.optics.layers.truth import (
     truth_table,
     with_channels,
     with_errors,
+    without_errors,
 )
 from hilstar.optics.layers.view import STILL, Canvas, View
 from hilstar.optics.paths import Paths
@@ -103,24 +105,34 @@ class FrameNoise:
         return None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Exposure:
     """One frame of the virtual tracker: DN (height, width), the electrons expected in it, and its
     stars.
 
-    DN and electrons are those of the raw mosaic where the tracker has one. `truth` has the rows of
+    DN and electrons are those of the raw mosaic where the tracker has one. `rows` are those of
     EXPOSURE_DTYPE, and of three channels CHANNEL_COLUMNS: what a star gives where all pixels have
     that colour. Places are those at the middle of the exposure (NaN behind the camera), and
     `clipped` stars reach full well or the ADC's last code. `capped` stars have paths coarser than
-    they should be.
+    they should be. `truth` is `rows` with the errors of the stars, which `errors` reads when they
+    are first asked for, or when the exposure is pickled: no centroid asks for them.
     """
 
     view: View
     dn: npt.NDArray[np.uint16]
     mean_e: FloatArray
-    truth: npt.NDArray[np.void]
+    rows: npt.NDArray[np.void]
     capped: int = 0
     faults: tuple[str, ...] = ()
+    errors: Callable[[npt.NDArray[np.void]], npt.NDArray[np.void]] = without_errors
+
+    @cached_property
+    def truth(self) -> npt.NDArray[np.void]:
+        """The stars of the exposure, as `hilstar simulate` writes them, brightest first."""
+        return self.errors(self.rows)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"truth": self.truth, "errors": without_errors}
 
     def __array__(
         self, dtype: npt.DTypeLike | None = None, copy: bool | None = None
@@ -131,7 +143,7 @@ class Exposure:
     def __repr__(self) -> str:
         height, width = self.dn.shape
         return (
-            f"<hilstar exposure: {len(self.truth)} stars, DN {self.dn.min()} to {self.dn.max()},"
+            f"<hilstar exposure: {len(self.rows)} stars, DN {self.dn.min()} to {self.dn.max()},"
             f" {width} x {height} px>"
         )
 
@@ -276,15 +288,16 @@ class Simulator(Closing):
             np.maximum(mean_e, 0.0, out=mean_e)
         dn = self._digitised(mean_e, rng)
         truth = exposure_truth(canvas, view, stars, light, mean_e, self.glass)
-        truth = with_errors(truth, stars.catalog, self.config.sky.epoch_jyear)
+        epoch_jyear = self.config.sky.epoch_jyear
+        errors = partial(with_errors, catalog=stars.catalog, epoch_jyear=epoch_jyear)
         if faults is None:
-            return Exposure(view, dn, mean_e, truth, light.capped)
+            return Exposure(view, dn, mean_e, truth, light.capped, errors=errors)
         added = _exposed(faults.added_truth())
         by_bv = stars.colours_by_bv
         added_shares = None if by_bv is None else shares_by_bv(by_bv, added["bv"])
         added = with_channels(added, added_shares)
         truth = np.concatenate([truth, added])
-        return Exposure(view, dn, mean_e, truth, light.capped, faults.names)
+        return Exposure(view, dn, mean_e, truth, light.capped, faults.names, errors)
 
     def _digitised(
         self, mean_e: FloatArray, rng: np.random.Generator | None

@@ -108,6 +108,11 @@ def with_channels(truth: npt.NDArray[np.void], colours: FloatArray | None) -> np
     return with_columns(truth, light)
 
 
+def without_errors(rows: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
+    """The rows as they are: of a frame whose stars have no errors at hand."""
+    return rows
+
+
 def with_errors(
     truth: npt.NDArray[np.void], catalog: Catalog, epoch_jyear: float
 ) -> npt.NDArray[np.void]:

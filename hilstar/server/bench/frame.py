@@ -36,6 +36,7 @@ from hilstar.optics.layers.truth import (
     sprite_truth,
     truth_table,
     with_errors,
+    without_errors,
 )
 from hilstar.optics.layers.view import STILL, Canvas, Layer, View
 from hilstar.optics.psf import Psf
@@ -65,11 +66,6 @@ WARM_UP_ATTITUDE = np.array([1.0, 0.0, 0.0, 0.0])
 WARM_UP_RATE_RAD_S = np.array([0.1, 0.0, 0.0])
 MOST = 0.5  # a pixel is a disc's if more than this share of its light is the disc's
 NAMED_STARS = 5
-
-
-def without_errors(rows: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
-    """The rows as they are: of a frame whose stars have no errors at hand."""
-    return rows
 
 
 @dataclass(frozen=True)

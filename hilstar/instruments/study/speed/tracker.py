@@ -206,6 +206,6 @@ def tracker_rows(rounds: int, budget_s: float) -> tuple[list[MethodTiming], list
             keys[f"{name} {kind}"] = name, kind
         times = in_turn(by_name, rounds, budget_s)
         width, height = file.config.tracker.resolution_px
-        cell = Cell(width, height, len(exposing.exposure.truth))
+        cell = Cell(width, height, len(exposing.exposure.rows))
     timed = {keys[name]: spent for name, spent in times.items()}
     return tracker_timings(timed, cell), skipped

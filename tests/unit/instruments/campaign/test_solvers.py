@@ -293,9 +293,7 @@ def test_stars_are_counted_in_view_found_matched_and_false(
     dn = exposure.dn.copy()
     for x, y in ((10, 20), (100, 90)):
         dn[y - 1 : y + 2, x - 1 : x + 2] += 2000
-    counted = (
-        solver("centroids").solve(replace(exposure, truth=truth, dn=dn), simulator).star_errors
-    )
+    counted = solver("centroids").solve(replace(exposure, rows=truth, dn=dn), simulator).star_errors
     assert counted is not None
     assert counted.stars == usual.stars + 2
     assert counted.found == usual.found + 2
@@ -376,7 +374,7 @@ def test_false_stars_are_those_that_match_none_and_no_star_at_the_edge_is_report
     assert errors is not None and answer.stars is not None
     # a crowded star is matched, and has no error of its own
     truth = np.concatenate([exposure.truth, exposure.truth])
-    crowded = solver("centroids").solve(replace(exposure, truth=truth, dn=dn), simulator)
+    crowded = solver("centroids").solve(replace(exposure, rows=truth, dn=dn), simulator)
     assert crowded.star_errors is not None
     for counted in (errors, crowded.star_errors):
         assert counted.false == counted.found - counted.matched >= 1

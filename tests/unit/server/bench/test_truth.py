@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -109,4 +110,9 @@ def test_the_table_that_python_has_is_the_one_that_is_written(tmp_path):
         exposure = simulator.expose(
             simulator.view(from_radec_roll_deg(84.0, -1.2, 0.0), np.zeros(3)), None
         )
-    assert np.isfinite(exposure.truth["sigma_pos_mas"][exposure.truth["hip"] > 0]).all()
+    is_listed = exposure.truth["hip"] > 0
+    assert np.isfinite(exposure.truth["sigma_pos_mas"][is_listed]).all()
+    # a centroid asks for no error, and a process is handed the truth with them
+    assert np.isnan(exposure.rows["sigma_pos_mas"]).all()
+    handed_on = pickle.loads(pickle.dumps(exposure))
+    assert handed_on.truth.tobytes() == exposure.truth.tobytes()

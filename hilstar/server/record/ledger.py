@@ -72,7 +72,9 @@ MAX_CHUNK_BYTES = 1_000_000
 MAX_DETAIL_CHARACTERS = 200
 # How long `close` waits for a disk that stalls, without and after a signal that ends the run.
 DISK_WAITS_S, STOPPED_DISK_WAITS_S = 20.0, 0.4
-MAX_REST_S = 60.0  # longest pause between new files after repeated damage
+# Longest pause between new files after repeated damage, and the pause after a part that could not
+# be begun.
+MAX_REST_S = 60.0
 STALLED_S = 5.0  # without a pass of the writer's thread the disk counts as stalled
 # Free shares of the disk at which the warning begins and ends.
 LOW_SHARE, WELL_SHARE = 0.10, 0.12
@@ -288,6 +290,7 @@ class Ledger(Closing):
         self._thin = self._moved = False
         self._renewed_s = -math.inf
         self._rest_s = EACH_S
+        self._split_after_s = -math.inf
         # The records with which a new file begins during a run: faults and a wrong sky that last.
         self.standing: Callable[[], list[FaultRecord | EventRecord]] = list
         self._file, self._writer = self._begin(path, overwrite)
@@ -424,10 +427,7 @@ class Ledger(Closing):
             self._file.note()
             if last:
                 self._writer.finish()
-            elif (
-                self._writer.size_bytes >= self._split.bytes
-                or now_s - self._begun_s >= self._split.seconds
-            ):
+            elif self._is_whole(now_s):
                 self._go_on_in_another()
         except Exception as error:  # no error ends the ledger or the run
             self._failed(error)
@@ -573,6 +573,13 @@ class Ledger(Closing):
             "ledger-failed", f"{self.path}: cannot be written ({self.failure}); the display goes on"
         )
 
+    def _is_whole(self, now_s: float) -> bool:
+        """Whether the next part of a split ledger is due, at `now_s` of the monotonic clock."""
+        if now_s < self._split_after_s:
+            return False
+        is_full = self._writer.size_bytes >= self._split.bytes
+        return is_full or now_s - self._begun_s >= self._split.seconds
+
     def _go_on_in_another(self) -> None:
         """Continue in the next part of a split ledger, or stay if it cannot be created."""
         self._part += 1
@@ -580,7 +587,7 @@ class Ledger(Closing):
             file, writer = self._begin(part_path(self.path, self._part), self._overwrite)
         except InputError as error:
             self._part -= 1
-            self._begun_s = time.monotonic()  # so that it is not tried at each pass
+            self._split_after_s = time.monotonic() + MAX_REST_S  # not tried at each pass
             self._notices.tell(
                 "ledger-split-failed", f"{error}; the ledger stays in its present file"
             )

@@ -208,6 +208,32 @@ def test_a_stopped_lead_in_ends(tmp_path):
     assert loop.tally.frames == 0
 
 
+@pytest.mark.parametrize(("stage", "frames"), [("blank", 61), ("paced", 61), ("idle", 0)])
+def test_a_gpu_that_is_lost_ends_a_run_whatever_its_loop_does(tmp_path, monkeypatch, stage, frames):
+    """It is looked for once a second: before the first attitude, between frames, and while no
+    frame is due.
+    """
+    clock = FakeClock()
+    shown: list[Shown] = []
+    bench = SlowBench(tmp_path, clock, lambda number: 0)
+    loop = FrameLoop(bench, shown.append, Pacer(PERIOD_NS, clock))
+    monkeypatch.setattr(WellGpu, "fault", lambda gpu: "the GPU was reset")
+
+    def draw(moment: Moment) -> Shown | None:
+        return loop.draw(moment.slot, 0, STILL, moment)
+
+    if stage == "blank":
+        loop.lead_in(draw, lambda: len(shown) == 200)
+    elif stage == "paced":
+        loop.paced(Limit(slots=200), draw)
+    else:
+        clock.work(1.1e9)
+        loop.idle()
+    assert loop.stop.is_set()
+    assert loop.notices.counts()["gpu-lost"] == 1
+    assert len(shown) == frames
+
+
 @pytest.mark.parametrize(("on_stale", "blank"), [("hold", False), ("blank", True)])
 def test_a_stale_attitude_is_held_or_blank_as_the_bench_file_says(tmp_path, on_stale, blank):
     run = LoopRun(

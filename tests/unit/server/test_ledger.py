@@ -518,6 +518,26 @@ def test_a_ledger_that_is_split_by_its_age_begins_each_part_anew(
     assert files == [1, 2, 2, 2, 3]
 
 
+@pytest.mark.parametrize("split", [SplitLimits(bytes=1.0), SplitLimits(seconds=5.0)])
+def test_a_part_that_cannot_be_begun_is_tried_again_a_minute_later(
+    tmp_path, small_bench, monkeypatch, split
+):
+    """And not five times a second, with an event each time."""
+    passing = LedgerTime(monkeypatch)
+    notices = Notices()
+    taken = tmp_path / "run.0001.mcap"
+    taken.mkdir()
+    tried = []
+    with Ledger(tmp_path / "run.mcap", small_bench, notices, split=split) as ledger:
+        for seconds in (6.0, 0.0, 50.0, 12.0):
+            passing.pass_by(seconds)
+            tried.append(notices.counts()["ledger-split-failed"])
+        taken.rmdir()
+        passing.pass_by(61.0)
+        assert ledger.summary()["files"] >= 2
+    assert tried == [1, 1, 1, 2]
+
+
 def test_a_ledger_that_is_harmed_again_and_again_rests_twice_as_long(
     tmp_path, small_bench, monkeypatch
 ):

@@ -29,6 +29,7 @@ from tests.support.fake_clock import FakeClock
 
 REFRESH_HZ = 60.0
 ONE_SECOND = Limit(slots=REFRESH_HZ)
+POLL_NS = 50 * NS_PER_MS  # between two looks of a run that nobody asks
 TURN_MS = 4.0  # from a request to its answer: what drawing takes on the test's clock
 
 
@@ -181,6 +182,17 @@ def test_a_run_lasts_for_its_refresh_periods_whatever_the_simulation_asks(run, s
     # it looks for the end once a poll of 50 ms
     assert slots / REFRESH_HZ <= done.lasted_s < slots / REFRESH_HZ + 0.05 + 1e-3 * TURN_MS
     assert done.summary.frames == 1
+
+
+def test_a_run_that_nobody_asks_says_so_once_and_its_loop_is_alive_all_along(small_bench):
+    """What systemd's watchdog hears of: else it ends a run whose simulation thinks for a while."""
+    clock = FakeClock()
+    loop = FrameLoop(small_bench, pacer=Pacer(NS_PER_S / REFRESH_HZ, clock))
+    lockstep = LockstepRun(small_bench, Limit(slots=5 * REFRESH_HZ), loop, Outlet())
+    summary = lockstep.serve(Simulation(clock))
+    assert summary.frames == 0
+    assert loop.notices.counts() == {"no-attitude": 1}
+    assert clock.ns - loop.watch.alive_ns <= POLL_NS
 
 
 def test_a_run_of_so_many_frames_answers_so_many(run):

@@ -21,6 +21,12 @@ const KEY_ZOOM = 2;
 const STEPS = [1, 2, 2.5, 5, 10];
 const TIME_STEPS_S = [0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 28800, 86400];
 
+// The times of a run's points before its newest one, s.
+export function timesOf(points) {
+  const last = points.length ? points[points.length - 1].t_s : 0;
+  return points.map((point) => point.t_s - last);
+}
+
 export function niceTop(value, ticks = 4) {
   if (!(value > 0)) return 1;
   const rough = value / ticks;
@@ -33,7 +39,8 @@ export function timeText(seconds, step) {
   const sign = seconds < 0 ? "\u2212" : "";
   const s = Math.abs(seconds);
   if (step < 60 && s <= 90) return `${sign}${Number(s.toFixed(1))}`;
-  const [hour, minute, second] = [Math.floor(s / 3600), Math.floor(s / 60) % 60, Math.round(s % 60)];
+  const whole = Math.round(s);
+  const [hour, minute, second] = [Math.floor(whole / 3600), Math.floor(whole / 60) % 60, whole % 60];
   const two = (part) => String(part).padStart(2, "0");
   return hour ? `${sign}${hour}:${two(minute)}:${two(second)}` : `${sign}${minute}:${two(second)}`;
 }

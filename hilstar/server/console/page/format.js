@@ -51,8 +51,9 @@ export function duration(seconds, digits = 0) {
   const s = Math.abs(seconds);
   if (s < 0.9995) return `${fixed(seconds * 1000, digits)}\u00a0ms`;
   if (s < 59.95) return `${sign}${s.toFixed(s < 9.995 ? Math.max(digits, 1) : 1)}\u00a0s`;
-  const minutes = Math.floor(s / 60);
-  if (minutes < 60) return `${sign}${minutes}\u00a0min ${String(Math.floor(s % 60)).padStart(2, "0")}\u00a0s`;
+  const whole = Math.max(Math.floor(s), 60); // the last moments of the first minute count to the second
+  const minutes = Math.floor(whole / 60);
+  if (minutes < 60) return `${sign}${minutes}\u00a0min ${String(whole % 60).padStart(2, "0")}\u00a0s`;
   return `${sign}${Math.floor(minutes / 60)}\u00a0h ${String(minutes % 60).padStart(2, "0")}\u00a0min`;
 }
 

@@ -1,6 +1,6 @@
 // The operator's page: passes the messages of the link to the picture, the map, the charts, the numbers and the health.
 
-import { Chart } from "./charts.js";
+import { Chart, timesOf } from "./charts.js";
 import { Controls, listKeys } from "./controls.js";
 import { nameStars, writeFigures } from "./figures.js";
 import { byId, clock, duration, write } from "./format.js";
@@ -198,17 +198,12 @@ function column(key, scale = 1) {
 
 function series(name, key, shade, digits) {
   const values = column(key);
-  return { name, ink: shade, digits, t: times(), low: values, high: values };
-}
-
-function times() {
-  const last = points.length ? points[points.length - 1].t_s : 0;
-  return points.map((point) => point.t_s - last);
+  return { name, ink: shade, digits, t: timesOf(points), low: values, high: values };
 }
 
 function drawCharts() {
   const span = -(hello?.history_s || HISTORY_S);
-  const t = times();
+  const t = timesOf(points);
   health.lately = column("missed").reduce((sum, n) => sum + (n || 0), 0);
   charts.age.set([series("age", "age_ms", "one", 1)], [], span, 0);
   charts.pacing.set([series("interval", "interval_ms", "one", 2), series("drawing", "frame_ms", "two", 2)], [{ name: "missed", ink: "bad", t, n: column("missed") }], span, 0);

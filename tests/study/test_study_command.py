@@ -7,9 +7,13 @@ import pytest
 from astropy.io import fits
 from astropy.wcs import WCS
 
+from hilstar.basics.errors import InputError
+from hilstar.cli.study import TIMED, study_lines
 from hilstar.sky.catalog import load_catalog
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.pictures import assert_drawn
+from tests.support.refusals import refusal
+from tests.support.studies import module_of
 from tests.support.tables import csv_rows
 
 # The thesis's own figures: the hottest star of Orion (figure 5.5), the mean temperature before
@@ -157,3 +161,20 @@ def test_an_unwritable_directory_and_an_unknown_study_are_refused(tmp_path):
     )
     assert_refused(run_hilstar_here("study", "weather", "-o", tmp_path), 2, "weather")
     assert_refused(run_hilstar_here("study", "models"), 2, "-o")
+
+
+@pytest.mark.parametrize("quick", [False, True])
+@pytest.mark.parametrize("name", sorted(TIMED))
+def test_a_study_of_times_is_quick_where_it_is_asked_to_be_alone(
+    name, quick, tmp_path, monkeypatch
+):
+    """Its rounds are counted by what it is asked; they would take minutes."""
+    asked = []
+
+    def refused(is_quick: bool) -> None:
+        asked.append(is_quick)
+        raise InputError("a test measures nothing")
+
+    monkeypatch.setattr(module_of(name), "measure", refused)
+    assert refusal(study_lines, name, tmp_path, quick) == "a test measures nothing"
+    assert asked == [quick]

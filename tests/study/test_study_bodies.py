@@ -223,6 +223,15 @@ def test_a_small_study_of_bodies_draws_its_rows(small_run):
     for panel, column in enumerate(("cpu_ms", "over_white_mag")):
         drawn = [(x, y) for _, x, y in run.lines("bodies_limits", panel)]
         assert ([40.0, 0.5], [float(row[column]) for row in nears]) in drawn
+    # a frame has 1/60 s, and white is 0 mag over white
+    assert run.levels("bodies_limits", 0) == {"60 Hz": pytest.approx(1000 / 60)}
+    assert run.levels("bodies_limits", 1) == {"white": 0.0}
+    # a percent of light, a tenth of a pixel, and a point under 0.2 px across
+    assert [run.levels("bodies_size", panel) for panel in range(2)] == [
+        {"limit": 0.01},
+        {"limit": 0.1},
+    ]
+    assert run.places("bodies_size", 2) == [0.1]
     cost, size, limit = run.told[0]
     largest = max(abs(float(row["flux_off"])) for row in sizes)
     limb_px = max(float(row["limb_off_px"]) for row in sizes if row["limb_off_px"] != "nan")

@@ -280,6 +280,7 @@ def test_a_study_s_tables_and_lines_are_of_what_each_part_measures(small_run, tm
             assert list(row.values()) == [str(value) for value in asdict(planted).values()]
     assert "class" in run.rows("colour_class")[0]
     assert_recorded(run.folder / "colour_red.csv", ("sensor",), tuple("OBAFGKM"))
+    assert run.levels("colour", 0) == {"published, 6.55": 6.55}
     findings = run.told[0]
     assert findings[0] == run.title("colour")
     assert findings[1] == "lateral colour of planar-1897 by star on OLED: off by 5% of the sky's"

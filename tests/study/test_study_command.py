@@ -7,9 +7,14 @@ import pytest
 from astropy.io import fits
 from astropy.wcs import WCS
 
+from hilstar.basics.errors import InputError
+from hilstar.cli.study import TIMED, study_lines
+from hilstar.instruments.study import rigs
 from hilstar.sky.catalog import load_catalog
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.pictures import assert_drawn
+from tests.support.refusals import refusal
+from tests.support.studies import module_of
 from tests.support.tables import csv_rows
 
 # The thesis's own figures: the hottest star of Orion (figure 5.5), the mean temperature before
@@ -157,3 +162,28 @@ def test_an_unwritable_directory_and_an_unknown_study_are_refused(tmp_path):
     )
     assert_refused(run_hilstar_here("study", "weather", "-o", tmp_path), 2, "weather")
     assert_refused(run_hilstar_here("study", "models"), 2, "-o")
+
+
+# What each study asks first, by whether it is quick.
+MEASURES = {
+    **dict.fromkeys(sorted(TIMED), ("measure", False, True)),
+    "geometry": ("frames_of", False, True),
+    "limits": ("every_limit", False, True),
+    "rigs": ("place_rows", rigs.ATTITUDES, 4),
+}
+
+
+@pytest.mark.parametrize("quick", [False, True])
+@pytest.mark.parametrize("name", MEASURES)
+def test_a_study_is_quick_where_it_is_asked_to_be_alone(name, quick, tmp_path, monkeypatch):
+    """What it measures by is read as it asks for it: a whole one takes minutes."""
+    function, in_whole, if_quick = MEASURES[name]
+    asked = []
+
+    def refused(by: bool | int) -> None:
+        asked.append(by)
+        raise InputError("a test measures nothing")
+
+    monkeypatch.setattr(module_of(name), function, refused)
+    assert refusal(study_lines, name, tmp_path, quick) == "a test measures nothing"
+    assert asked == [if_quick if quick else in_whole]

@@ -180,6 +180,7 @@ def test_a_small_study_of_faults_draws_its_rows(small_run):
             )
         spoilt = min(float(row["share_of_white"]) for row in own if float(row["p95_mag"]) > 0.1)
         assert f"from {spoilt:g} of white on with {name}" in run.title("faults")
+    assert run.levels("faults", 0) == {"0.1 mag": 0.1}
     for panel, name in enumerate(QUANTISATIONS):
         own = [row for row in costs if row["quantisation"] == name]
         drawn = {label: x for label, x, _ in run.lines("faults_cost", panel)}

@@ -280,6 +280,31 @@ def test_equation_2_3_gives_the_check_values_of_its_quaternions():
         np.testing.assert_allclose(matrix.T, to_matrix(np.array(q)), atol=1e-6)
 
 
+def test_orion_s_frames_show_one_sky_about_the_boresight_of_each(small_run):
+    """At 84.057 and -1.2 degrees: x and z of the sky, and the middle of the camera; north is up in
+    both, and east left.
+    """
+    run = small_run(sky_figures.frames)
+    ra_rad, dec_rad = np.radians([84.057, -1.2])
+    (stars, boresight), (seen, middle) = (
+        [(x, y) for _, x, y in run.lines("frames", panel)] for panel in range(2)
+    )
+    assert boresight == (
+        pytest.approx([math.cos(dec_rad) * math.cos(ra_rad)]),
+        pytest.approx([math.sin(dec_rad)]),
+    )
+    assert middle == ([0.0], [0.0])
+    rows = run.rows("frames")
+    for line, x, y in ((stars, "x_icrs", "z_icrs"), (seen, "x_cam", "y_cam")):
+        assert line == tuple([float(row[name]) for row in rows] for name in (x, y))
+    # within 12.5 degrees of the boresight along each axis
+    assert 0.9 < np.abs(seen).max() / math.sin(math.radians(12.5)) < 1.0
+    assert np.corrcoef(stars[1], seen[1])[0, 1] < -0.99
+    sky, image = run.charts["frames"].axes
+    assert image.yaxis_inverted() and not sky.yaxis_inverted()
+    assert len(rows) > 300 and f"{len(rows)} stars of Orion" in run.told.text
+
+
 def test_light_is_photons_of_its_wavelength():
     photons = sky_figures._photons_of(np.ones_like(sky_figures.SHOWN_NM))
     at_nm = float(sky_figures.SHOWN_NM[40])

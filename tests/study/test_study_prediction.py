@@ -146,6 +146,9 @@ def test_a_small_study_is_off_by_what_its_packets_leave(small_run, monkeypatch):
     findings, _ = run.told
     assert findings[0] == run.title("prediction") and len(findings) == 1 + 5 + 1
     assert findings[1].startswith(f"hold: {held_arcsec:.3g} arcsec rms, ")
+    # a vibration that is shown as it is has a gain of 1
+    for panel in (2, 3):
+        assert list(run.levels("prediction_jitter", panel).values()) == [1.0]
     jitter = typed_rows(run.folder / "prediction_jitter.csv", Shaken)
     assert len(jitter) == 2 * 3 * 3
     for panel, (packets, share) in enumerate(

@@ -225,3 +225,15 @@ class SmallRun:
             x, y = (np.asarray(values, dtype=float).tolist() for values in line.get_data())
             lines.append((str(line.get_label()), x, y))
         return lines
+
+    def levels(self, stem: str, panel: int) -> dict[str, float]:
+        """Where each line across a chart's whole panel stands, by its label."""
+        across = {}
+        for label, x, y in self.lines(stem, panel):
+            if x == [0.0, 1.0] and y[0] == y[-1]:
+                across[label] = y[0]
+        return across
+
+    def places(self, stem: str, panel: int) -> list[float]:
+        """Where the lines from the bottom to the top of a chart's panel stand."""
+        return [x[0] for _, x, y in self.lines(stem, panel) if y == [0.0, 1.0] and x[0] == x[-1]]

@@ -110,3 +110,17 @@ def test_the_copy_gets_white_its_error_and_its_freedom(small_bench_file):
     assert config.render.flux_at_white_e_per_s == pytest.approx(1.01e6)
     assert config.certify.flux_at_white_dof == 2
     assert config.certify.flux_at_white_relative == pytest.approx(found.relative_error, rel=5e-3)
+
+
+def test_the_copy_stands_in_the_bench_file_s_own_folder(small_bench_file):
+    """However that is written; another of the same name has none of its files."""
+    path = small_bench_file
+    found = scale_of(1e6, np.array([1.0, 1.02]), np.zeros(2))
+    other = path.parent / "other" / path.parent.name
+    other.mkdir(parents=True)
+    file = read_bench_file(path)
+    line = refusal(with_flux_at_white, file, found, other / "scaled.toml")
+    assert line.endswith(f"write the copy beside {path}")
+    assert not (other / "scaled.toml").exists()
+    with_flux_at_white(file, found, other / ".." / ".." / "scaled.toml")
+    assert read_config(path.parent / "scaled.toml").certify.flux_at_white_dof == 1

@@ -14,10 +14,11 @@ from hilstar.instruments.calibrate.first_light import session
 from hilstar.instruments.calibrate.first_light.context import (
     DarkSubtracted,
     FittedFigure,
+    StepContext,
     StepOutcome,
     StepRecord,
 )
-from hilstar.instruments.calibrate.first_light.image_sources import complete_images
+from hilstar.instruments.calibrate.first_light.image_sources import Pattern, black, complete_images
 from hilstar.instruments.calibrate.first_light.photometer import _seen
 from hilstar.instruments.calibrate.first_light.session import (
     FIRST_LIGHT,
@@ -145,6 +146,45 @@ def test_figures_are_known_of_steps_that_are_done(tmp_path):
     context = session._context(STEPS[0], goes_on=False)
     assert context.known == {"done.figure": 1.0}
     assert context.folder == tmp_path / "s" / "images" / f"{STEPS[0].name}-1"
+
+
+def test_a_step_is_given_what_its_session_was_asked_for(tmp_path):
+    """The readings of the response, the watch over white and the frames of a field; whoever
+    watches sees each pattern.
+    """
+    steps = (SessionStep("", "", "", name="only"),)
+    contexts, watched = [], []
+
+    def asked(context: StepContext) -> StepOutcome:
+        contexts.append(context)
+        context.watch(pattern)
+        return StepOutcome("done", "it was asked", {"figure": 1.5})
+
+    closed = closed_context(tmp_path, ClosedCamera())
+    pattern = Pattern("dots", black(closed.resolution_px))
+    session = FirstLightSession(
+        tmp_path / "s",
+        closed.file,
+        closed.source,
+        7,
+        watched.append,
+        watched_s=600.0,
+        frames=3,
+        plan=SessionPlan(steps, {"only": asked}),
+    )
+    said = []
+    (tmp_path / "s").mkdir()
+    assert session.run(frozenset(), said.append) == 0
+    (context,) = contexts
+    assert (context.patches, context.watched_s, context.frames) == (7, 600.0, 3)
+    assert context.file is closed.file and context.source is closed.source
+    assert watched == [pattern]
+    assert said[-1].split() == ["only", "done:", "it", "was", "asked"]
+    # what is done is not asked again
+    session.run(frozenset(), said.append)
+    assert len(contexts) == 1 and "done before" in said[-1]
+    session.run(frozenset({"only"}), said.append)
+    assert [context.folder.name for context in contexts] == ["only-1", "only-1"]
 
 
 def test_the_newest_image_may_be_incomplete(tmp_path):

@@ -12,6 +12,7 @@ from hilstar.instruments.certify.budget import (
     BudgetTrials,
     Combined,
     Input,
+    _settled,
     by_trials,
     first_order,
     why_they_differ,
@@ -64,6 +65,22 @@ def test_trials_leave_a_fortieth_at_either_side(rng):
     found = by_trials(lambda z: z[0], [Input("x", "normal", "", 1, 1.0, "px")], rng, 200_000)
     limit = float(stats.norm.ppf(0.975))
     assert (found.lower[0], found.upper[0]) == pytest.approx((-limit, limit), abs=TAIL_ERROR)
+
+
+@pytest.mark.parametrize("row", range(4), ids=["mean", "standard", "lower", "upper"])
+@pytest.mark.parametrize(("standard", "half_digit"), [(0.99, 0.005), (0.1, 0.005), (1.01, 0.05)])
+def test_trials_go_on_until_two_digits_of_the_spread_and_of_both_ends_stand(
+    row, standard, half_digit
+):
+    """Of four batches, as far above as below: their mean is known to 2 / sqrt(3) of that at two
+    sigmas. Nothing is stated by the mean.
+    """
+    for share, stands in ((0.99, True), (1.01, row == 0)):
+        batches = np.ones((4, 4, 2))
+        batches[:, 1] = standard
+        off = share * half_digit * math.sqrt(3) / 2
+        batches[:, row, 1] += off * np.array([1.0, -1.0, 1.0, -1.0])
+        assert _settled(batches) == stands
 
 
 NORMAL = Input("steady", "normal", "", 1, 1.0, "px")

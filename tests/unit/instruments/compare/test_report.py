@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hilstar.basics.pages import DASH, OK, WARN
 from hilstar.instruments.compare import report
 from hilstar.instruments.compare.report import (
     MAX_LISTED,
@@ -26,6 +27,7 @@ from hilstar.instruments.compare.sky_comparison import (
     finding,
     star_lines,
 )
+from tests.support.card_texts import BAND, card_lines
 from tests.support.tables import csv_rows
 
 LIMITS = Limits(0.01, 0.02)
@@ -185,8 +187,22 @@ def test_the_table_and_the_page_have_each_star(tmp_path, figures):
     assert "Not the same sky" in page and "4 stars that differ, the worst first" in page
     for star in (NEW, GONE, FAINTER, MOVED):
         assert star.line() in page
-    assert "limit 0.01 mag" in page and "limit 0.02 px" in page
-    assert "0.39 mag" in page  # 95 % of 0.002, 0.004, 0.3 and 0.4
+    # 95 % of 0.002, 0.004, 0.3 and 0.4 mag, and of 0, 0.01, 0.012 and 0.5 px
+    assert card_lines(page)[BAND] == [
+        "Two skies compared",
+        "Not the same sky",
+        finding(comparison()).removeprefix("Not the same sky: ").capitalize(),
+        "5",
+        "stars compared",
+        "0.39 mag",
+        "flux error at 95 %; limit 0.01 mag",
+        "0.43 px",
+        "place error at 95 %; limit 0.02 px",
+        "1",
+        "missing stars",
+        "1",
+        "extra stars",
+    ]
     assert "In common" not in page
     write_report(tmp_path, comparison([SAME, BESIDE]))
     assert "The same sky" in (tmp_path / "compare.html").read_text()
@@ -229,6 +245,15 @@ def test_a_panel_with_what_is_common_has_its_stars_beyond_that():
     assert (light.common, light.limit) == (0.0456, 0.01)
     assert light.label("extra", 0) == "extra: 1\n(1 by what is common)"
     assert light.label("missing", 1) == "missing: 1"
+
+
+def test_a_kind_of_stars_of_one_image_alone_is_marked_where_there_are_any():
+    for stars, states in (([SAME, GONE, GONE], [WARN, OK]), ([SAME, NEW], [OK, WARN])):
+        *_, missing, extra = report._figures(comparison(stars))
+        assert [missing.state, extra.state] == states
+    # with no star in both there is no error
+    texts = [figure.text for figure in report._figures(comparison([GONE]))]
+    assert texts == ["1", DASH, DASH, "1", "0"]
 
 
 @pytest.mark.parametrize("more", [0, 1, 7])

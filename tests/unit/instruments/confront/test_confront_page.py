@@ -128,6 +128,21 @@ def test_marks_are_at_their_places_over_the_three_views_of_their_photograph(
     assert [base64.b64decode(data) for _, data in images[3:]] == [b"a", b"b", b"\x01"]
 
 
+def test_the_page_has_its_style_and_the_script_that_its_buttons_need(written: Written) -> None:
+    """The script counts a frame's buttons: an image for each of the first, then two ways to see
+    several.
+    """
+    style, script = page.STYLE.read_text(), page.SCRIPT.read_text()
+    assert f"<style>{style}</style>" in written.text
+    assert f"<script>{script}</script>" in written.text
+    first_frame = written.text.partition('<div class="frame">')[2].partition("</svg>")[0]
+    buttons = re.findall('<button type="button">(.*?)</button>', first_frame)
+    assert buttons == [*page.VIEWS, "blink", "side by side"]
+    assert "const [BLINK, SIDE_BY_SIDE] = [3, 4];" in script
+    used = re.findall(r'querySelector(?:All)?\("\.(\w+)"\)', script)
+    assert used and all(f'class="{name}"' in written.text for name in used)
+
+
 def test_a_chart_of_light_has_stars_that_stand_alone_by_v_and_colour(written: Written) -> None:
     """Seen less predicted: 1000 of 900 DN, 5000 of 5500, 1000 of 1100, and 90 of 99 of V = 7.5."""
     figure = written.drawn[0]

@@ -31,6 +31,7 @@ from hilstar.instruments.confront.star_psf import (
     Measured,
     Stamps,
     StarPsf,
+    _shape,
     _ShapeLoss,
     cut_stamps,
     field_terms,
@@ -446,7 +447,8 @@ def test_stars_of_a_psf_have_no_residuals_by_it_but_its_priors_and_slopes_by_eac
     shown = flux_dn[:, None, None] * psf.on_pixels(dx, dy, core)[0] + 7.0
     one = np.ones(5)
     at = Measured(*places_px.T, flux_dn, one, one, one)
-    loss = _ShapeLoss(replace(stamps, values=shown), at, psf, GAIN, wide=True)
+    seen = replace(stamps, values=shown)
+    loss = _ShapeLoss(seen, at, psf, GAIN, wide=True)
     start = loss.start
     off = loss.residuals(start)
     pixels = nothing.size
@@ -458,3 +460,10 @@ def test_stars_of_a_psf_have_no_residuals_by_it_but_its_priors_and_slopes_by_eac
         wanted = (loss.residuals(start + step) - loss.residuals(start - step)) / (2 * STEP)
         within = 1e-5 * np.abs(wanted).max()
         assert slopes[:, number] == pytest.approx(wanted, abs=within)
+    # of another PSF only the core moves, until colour and wings are fitted, too
+    other = replace(psf, colour=0.1, wing_share=0.2)
+    first = _shape(seen, at, other, GAIN, wide=False)
+    assert (first.colour, first.wing_share, first.wing_sigma_px) == (0.1, 0.2, psf.wing_sigma_px)
+    assert np.abs(first.covariance - covariance).max() > 0.01
+    then = _shape(seen, at, first, GAIN, wide=True)
+    assert abs(then.wing_share - psf.wing_share) < 0.02

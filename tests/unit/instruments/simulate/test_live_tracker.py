@@ -4,6 +4,8 @@ errors that are planted.
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from scipy.special import ndtr
@@ -400,6 +402,32 @@ def test_a_packet_has_the_flags_of_its_mode_and_of_what_is_known():
         encode(answer_packet(Answer(0, b"", 5, valid=False, mode="too few stars", star_count=2), 4))
     )
     assert (none.flags, none.stars) == (protocol.ANSWER_TOO_FEW_STARS, 2)
+
+
+@pytest.mark.parametrize(("q", "q_flag"), [(None, 0), (IDENTITY, protocol.ANSWER_VALID)])
+@pytest.mark.parametrize(
+    ("rate", "rate_flag"), [(None, 0), (np.ones(3), protocol.ANSWER_RATE_VALID)]
+)
+@pytest.mark.parametrize(
+    ("mode", "mode_flag"),
+    [
+        (TRACKING, protocol.ANSWER_TRACKING),
+        (LOST, protocol.ANSWER_LOST_IN_SPACE),
+        (TOO_FEW, protocol.ANSWER_TOO_FEW_STARS),
+        (BLINDED, protocol.ANSWER_BLINDED),
+        ("of another vendor", 0),
+    ],
+)
+def test_a_packet_and_an_object_say_of_attitude_and_rate_which_is_known(
+    q, q_flag, rate, rate_flag, mode, mode_flag
+):
+    answer = Answer(7, b"", 5, q, rate, q is not None, mode, 9)
+    packet = answer_packet(answer, 3)
+    assert packet.flags == q_flag + rate_flag + mode_flag
+    assert packet.t_ns == 5  # of the tracker's own clock
+    told = json.loads(json_answer(answer))
+    assert ("q" in told, "rate" in told) == (q is not None, rate is not None)
+    assert (told["valid"], told["mode"]) == (q is not None, mode)
 
 
 OWN_SOLVER = """

@@ -6,13 +6,15 @@ from __future__ import annotations
 
 import itertools
 import threading
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from hilstar.basics.units import NS_PER_S
+from hilstar.basics.rotation import from_rotation_vector, multiply, random_attitude
+from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
 from hilstar.instruments.simulate import tracker_process
 from hilstar.instruments.simulate.live_exposure import LOST, TRACKING, Exposed, Solved
 from hilstar.instruments.simulate.tracker_process import Planted, TrackerProcess
@@ -111,6 +113,23 @@ def test_its_own_error_is_counted_before_anything_is_planted(process):
     summary = process.tally.summary()
     assert summary["own_bias_arcsec"] == pytest.approx([0.0] * 3, abs=1e-9)
     assert summary["answers"] == 2
+
+
+def test_its_own_bias_turns_the_true_attitude_to_the_one_it_found(process, rng):
+    """Found by 3, -2 and 7 arcsec about cam x, y and z beyond the truth, give or take 1 arcsec
+    about x.
+    """
+    true = random_attitude(rng)
+    for about_x_arcsec in (2.0, 4.0):
+        turn_rad = np.array([about_x_arcsec, -2.0, 7.0]) / ARCSEC_PER_RAD
+        found = multiply(from_rotation_vector(turn_rad), true)
+        solved = solved_at(process, 1.0)
+        exposed = replace(solved.exposed, q_icrs_to_cam=true)
+        identified = replace(solved.identified, q_icrs_to_cam=found)
+        process._report(replace(solved, exposed=exposed, identified=identified))
+    summary = process.tally.summary()
+    assert summary["own_bias_arcsec"] == pytest.approx([3.0, -2.0, 7.0], abs=1e-6)
+    assert summary["own_sigma_arcsec"] == pytest.approx([1.0, 0.0, 0.0], abs=1e-6)
 
 
 RATE_HZ, EXPOSURE_S, REFRESH_HZ = 5.0, 0.1, 50.0

@@ -14,6 +14,7 @@ import pytest
 
 from hilstar.basics.error_spread import ErrorSpread
 from hilstar.instruments.verify.measure import (
+    GeometryFit,
     GlowFit,
     MatchTally,
     Measured,
@@ -22,7 +23,7 @@ from hilstar.instruments.verify.measure import (
     glass_effect,
 )
 from hilstar.instruments.verify.summary import summarise, summary_lines, write_report
-from hilstar.instruments.verify.verdict import judge
+from hilstar.instruments.verify.verdict import Verdict, judge
 from hilstar.optics.camera import Camera
 from tests.support import planted_verdicts
 from tests.support.tables import csv_rows
@@ -155,6 +156,45 @@ def test_the_lines_have_the_figures():
     failed = summary_lines(summarise(judge(measured(glow=GlowFit(5.0, 7.0, 1.0)))))
     assert failed[-1] == "verdict             NOT passed"
     assert "the screen's black gives 7 e-/s in a tracker pixel where 5 are assumed" in failed[-2]
+
+
+def test_a_geometry_is_told_in_arcsec_and_degrees_by_the_keys_of_one_that_is_not_known():
+    fit = GeometryFit(
+        scale_error=0.01,
+        rotation_rad=1e-3,
+        offset_px=(0.5, -0.25),
+        tilt_rad=(0.01, -0.02),
+        tilt_px=0.3,
+        k1=-0.02,
+        distortion_px=0.4,
+        left=0.5,
+        left_px=0.6,
+    )
+    errors = planted_verdicts.display_errors([planted_verdicts.star()], geometry=fit)
+    told = summarise(Verdict(measured(), errors, []))
+    wanted = {
+        "scale_error": 0.01,
+        "rotation_arcsec": pytest.approx(1e-3 * ARCSEC_PER_RAD),
+        "offset_px": (0.5, -0.25),
+        "tilt_deg": pytest.approx((0.01 * 180 / math.pi, -0.02 * 180 / math.pi)),
+        "k1": -0.02,
+        "distortion_px": 0.4,
+    }
+    assert {key: told[key] for key in wanted} == wanted
+    unknown = summarise(Verdict(measured(), replace(errors, geometry=None), []))
+    assert list(unknown) == list(told)
+    assert [unknown[key] for key in wanted] == [None] * len(wanted)
+
+
+@pytest.mark.parametrize(("reasons", "word"), [([], "passed"), (["off"], "not passed")])
+@pytest.mark.parametrize("lost", [0, 1])
+def test_a_verdict_is_true_where_no_reason_is_against_it_though_a_star_is_lost(lost, reasons, word):
+    stars = [planted_verdicts.star()]
+    errors = planted_verdicts.display_errors(stars, lost=[planted_verdicts.lost_star()] * lost)
+    verdict = Verdict(measured(), errors, reasons)
+    assert bool(verdict) == verdict.passed == (not reasons)
+    counts = f"stars: {1 + lost}, reasons against it: {len(reasons)}"
+    assert repr(verdict) == f"<hilstar verdict: {word}, {counts}>"
 
 
 def test_a_field_without_a_star_has_no_figures_and_lines_all_the_same():

@@ -51,6 +51,7 @@ from hilstar.instruments.certify.structure import (
     Structure,
     _finer,
     _rectangle,
+    in_place,
     in_time,
     lasting_root,
     weighed,
@@ -642,3 +643,14 @@ def test_structure_that_would_have_shown_is_none_and_the_noise_is_that_of_the_re
     assert structure.total == 0.0 and not list(structure.parts())
     assert math.isinf(structure.dof)
     assert structure.noise_variance == pytest.approx(30 * (0.25 + 4) / 59)
+
+
+@pytest.mark.parametrize("axes", [1, 2])
+def test_the_noise_of_readings_in_place_is_that_of_one_along_an_axis(rng, axes):
+    """Three readings of each dot."""
+    lattice = np.meshgrid(np.arange(20.0), np.arange(15.0))
+    x, y = (np.repeat(part.ravel() * 20.0, 3) for part in lattice)
+    terms = np.ones((axes, len(x), 1))
+    found = in_place(x, y, 3.0 * rng.normal(size=(axes, len(x))), terms)
+    four_sigma = 4 * math.sqrt(2 / (axes * len(x)))
+    assert found.noise_variance == pytest.approx(9.0, rel=four_sigma)

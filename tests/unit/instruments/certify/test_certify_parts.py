@@ -41,6 +41,7 @@ from hilstar.instruments.certify.estimates import (
     _is_better,
     _LightFit,
     _scatter,
+    light_deviation,
 )
 from hilstar.instruments.certify.model import Figures
 from hilstar.instruments.certify.structure import (
@@ -59,6 +60,7 @@ from hilstar.instruments.certify.structure import (
 from hilstar.optics.camera import Camera
 from hilstar.server.bench.bench_file import BenchFile, bench_file_of
 from tests.support.planted_certify import BENCH, reference_star, stated_bench
+from tests.support.refusals import refusal
 
 SIZE_PX = (1920, 1080)
 ROUNDING = 1e-9
@@ -588,6 +590,17 @@ def test_black_and_light_are_both_read_more_than_once(dark, lit):
     light = 10.0 * codes + np.arange(len(codes))
     with pytest.raises(InputError, match="white and black are read too seldom"):
         _LightFit(LightReadings(codes, light, np.zeros(len(codes))))
+
+
+def test_white_within_the_scatter_of_black_is_no_light(tmp_path):
+    """300 above a black of four readings, whose mean is known to 258."""
+    text = BENCH.format(calibration="light.toml", delay_ms=8.0, geometry="", white=1e6)
+    file = bench_file_of(tmp_path / "bench.toml", text)
+    codes = np.array([0] * 4 + [50, 100, 150, 200, 255] * 2)
+    lit = 600.0 + 60.0 * np.arange(1, 6)
+    light = np.concatenate([[0.0, 400.0, 800.0, 1200.0], lit, lit])
+    read = LightReadings(codes, light, np.zeros(14))
+    assert "white reads no light above black" in refusal(light_deviation, file, read)
 
 
 def test_a_certificate_has_the_hashes_of_the_bench_s_files_and_of_those_that_they_name(

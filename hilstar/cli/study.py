@@ -90,8 +90,7 @@ def study(options: StudyOptions, pointing: FieldOptions) -> None:
     refuse_unused(options, pointing)
     place = place_of("study", pointing)
     answers: list[str] = []
-    steps = CHAIN_SCENES if options.what == "chain" else math.inf
-    with progress(f"study {options.what}", steps) as advance:
+    with progress(f"study {options.what}", steps_of(options.what)) as advance:
         if options.images is not None:
             from hilstar.instruments.study.confront import run as confront_set
 
@@ -117,6 +116,13 @@ def study(options: StudyOptions, pointing: FieldOptions) -> None:
     }
     lines = [*lines, f"figures and tables in {options.output}", *answers]
     print_found(options.as_json, fields, lines)
+
+
+def steps_of(what: Study) -> float:
+    """The steps of a study's progress bar: the scenes of `chain`, infinite for all others."""
+    if what == "chain":
+        return CHAIN_SCENES
+    return math.inf
 
 
 def refuse_unused(options: StudyOptions, pointing: FieldOptions) -> None:

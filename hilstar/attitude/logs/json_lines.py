@@ -42,6 +42,10 @@ VALIDITY = {"true": True, "1": True, "false": False, "0": False}
 ARRAY_BEGINS = re.compile(r"\[(?:\{|\[|\]|$)")
 # A whole string, a brace, or the quote of a string that goes on in the next piece.
 TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|[{}"]')
+# A whole string, or one that a file's end cuts.
+STRING = re.compile(r'"(?:[^"\\]|\\.)*(?:"|\\?$)')
+# A brace that begins no value of an object or an array: an object that follows one without an end.
+NO_VALUE = re.compile(r"[^:,\[\s]\s*\{")
 # What may stand between objects.
 BETWEEN = re.compile(r"[\s,\[\]]*")
 MAX_OBJECT_CHARACTERS = 65_536  # an answer with the centroids of a thousand stars
@@ -155,11 +159,14 @@ class JsonObjects:
 
     def _is_cut_off(self, waiting: str) -> bool:
         """Whether what is left is one object that a cut file ends in. One without an end between
-        others has their brackets, too, and is refused.
+        others has their keys or their braces, too, and is refused.
         """
         is_begun = self._count > 0 and waiting.startswith("{")
         is_short = len(waiting) <= MAX_OBJECT_CHARACTERS
-        return is_begun and is_short and waiting.count("{") == 1
+        if not (is_begun and is_short):
+            return False
+        has_key_twice = any(waiting.count(key) > 1 for key in JSON_KEYS)
+        return not has_key_twice and NO_VALUE.search(STRING.sub('""', waiting)) is None
 
     def _next_object(self, text: str, place: int) -> int:
         """The place of what follows the commas, blanks and brackets from a place on."""

@@ -108,6 +108,10 @@ def _judge_host(host: str, text: str) -> tuple[str, bool, bool]:
                 f" {ENDPOINT_FORM}"
             ) from error
         return host, False, False
+    if address.is_multicast:
+        raise InputError(
+            f"{shortened(text)}: {address} is not an address of one machine; {ENDPOINT_FORM}"
+        )
     mapped = getattr(address, "ipv4_mapped", None)
     if mapped is not None:
         raise InputError(

@@ -324,15 +324,16 @@ class LiveTracker(Closing):
 
     def rate_cam_rad_s(self) -> FloatArray:
         """The turn between the last two attitudes (3,), cam; 0 where there are none of the last
-        second.
+        second, and where both are of one moment.
         """
         if self._before is None or self._last is None:
             return np.zeros(3)
         before_ns, before_q = self._before
         last_ns, last_q = self._last
-        if last_ns - before_ns > TURN_S * NS_PER_S:
+        apart_s = (last_ns - before_ns) / NS_PER_S
+        if not 0 < apart_s <= TURN_S:
             return np.zeros(3)
-        return rate_between_rad_s(before_q, last_q, (last_ns - before_ns) / NS_PER_S)
+        return rate_between_rad_s(before_q, last_q, apart_s)
 
     def _found(
         self, dn: npt.NDArray[np.uint16], exposed: Exposed, expected: FloatArray | None

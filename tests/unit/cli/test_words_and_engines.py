@@ -5,6 +5,7 @@ what it says of the engine's result is that result: the engines are the test's.
 from __future__ import annotations
 
 import json
+import math
 import socket
 import threading
 from collections.abc import Callable
@@ -51,6 +52,7 @@ from hilstar.cli.study import (
     StudyOptions,
     findings_of,
     refuse_unused,
+    steps_of,
     thesis_lines,
 )
 from hilstar.cli.tracker import (
@@ -315,6 +317,10 @@ def test_a_study_takes_quick_where_a_part_of_it_is(what: str) -> None:
     run = import_module(f"hilstar.instruments.study.{module}").run
     assert ("quick" in signature(run).parameters) is (what not in WHOLE)
     assert (get_type_hints(run)["return"] == Judged) is (what in TIMED)
+
+
+def test_the_bar_of_a_study_counts_the_five_scenes_of_a_chain_and_nothing_else() -> None:
+    assert [steps_of(what) for what in ("chain", "models", "timing")] == [5, math.inf, math.inf]
 
 
 @pytest.mark.parametrize("right", [True, False, None])
@@ -739,6 +745,16 @@ def test_an_exposure_is_summed_up_by_its_numbers(tmp_path: Path) -> None:
     dn = fits.getdata(tmp_path / "o.fits")
     assert told["dn"] == {"min": dn.min(), "mean": pytest.approx(dn.mean()), "max": dn.max()}
     assert told["written"] == ["o.fits"] and told["faults"] == []
+
+
+def test_an_exposure_at_a_moment_has_the_faults_that_are_on_then(tmp_path: Path) -> None:
+    (tmp_path / "bench.toml").write_text(bench_text({"tracker": {"resolution_px": [128, 96]}}))
+    ghost = 'kind = "false-star"\nname = "ghost"\ntracker_px = [40, 50]\nelectrons = 1e5\n'
+    (tmp_path / "ghost.toml").write_text(f"[[fault]]\n{ghost}at_s = 1.0\nfor_s = 1.0\n")
+    words = "simulate bench.toml --radec 84,-1,0 -o o.fits --scenario ghost.toml --json --at"
+    for at_s, faults in (("1.5", ["ghost"]), ("0.5", [])):
+        told = json.loads(run_hilstar_here(words, at_s, cwd=tmp_path).stdout)
+        assert told["faults"] == faults
 
 
 def test_a_log_s_exposures_have_the_faults_of_a_scenario(

@@ -11,11 +11,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
+from hilstar.server.record.answer_figures import AnswerTally
 from hilstar.server.record.ledger_records import (
     LOST,
     AnswerRecord,
     CountRecord,
     EventRecord,
+    FaultRecord,
     FrameRecord,
     PacketForm,
     ProcessRecord,
@@ -314,3 +316,34 @@ def test_the_residuals_of_a_chart_are_those_of_right_answers():
         answer.residual_arcsec = None if verdict == "unpaired" else (k + 0.1, k + 0.2, k + 0.3)
         figures.add(answer)
     assert figures.residuals.rows.tolist() == [[0.0, 0.1, 0.2, 0.3], [5.0, 5.1, 5.2, 5.3]]
+
+
+@pytest.mark.parametrize("block", [1, 4, 100])
+def test_the_faults_of_a_replayed_run_are_those_of_its_frames_however_records_are_cut(block):
+    """Of ten frames, a second apart, three have one; an answer follows each."""
+    figures = RunFigures({})
+    figures.answers = AnswerTally(BEGIN_NS)
+    flash = FaultRecord(
+        host_ns=BEGIN_NS - 1, event="start", number=4, name="sun", kind="flash", who="", t_ns=0,
+        table="",
+    )  # fmt: skip
+    records: list[RunRecord] = [flash]
+    for k in range(10):
+        swap_ns = host_ns(1000.0 * k)
+        frame = FrameRecord(frame=k, t_ns=k, light_ns=swap_ns, draw_ns=swap_ns, swap_ns=swap_ns)
+        if 3 <= k < 6:
+            frame.faults = (4,)
+        middle_ns = swap_ns + NS_PER_S // 2
+        verdict = "wrong" if frame.faults else "right"
+        records.append(frame)
+        records.append(
+            AnswerRecord(host_ns=middle_ns, raw="", middle_ns=middle_ns, verdict=verdict)
+        )
+    for first in range(0, len(records), block):
+        figures.add(*records[first : first + block])
+    answers = summarise(figures).answers
+    assert answers is not None
+    (fault,) = answers.faults
+    assert (fault.name, fault.start_s, fault.end_s) == ("sun", 3.0, 6.0)
+    wrong = [span.wrong for span in (fault.before, fault.during, fault.after)]
+    assert wrong == [0, 3, 0]

@@ -12,6 +12,7 @@ from hilstar.attitude.logs.log_file import open_log
 from hilstar.attitude.logs.telemetry import read_telemetry
 from hilstar.basics.errors import InputError
 from hilstar.basics.reading import MAX_LINE_CHARACTERS
+from tests.support.refusals import refusal
 
 ROWS: list[dict[str, Any]] = [
     {"t_ns": k * 10**7, "q": [0.5, -0.5, 0.5, 0.5], "note": 'a } " { [ \\'} for k in range(4)
@@ -76,6 +77,31 @@ def test_an_object_that_the_file_s_end_cuts_is_left_out_and_said(path, begin, be
     log = open_log(path)
     assert len(log.samples) == len(ROWS) - 1
     assert dict(log.told)["log-cut"].startswith("the last object has no end")
+
+
+@pytest.mark.parametrize(
+    "last",
+    [
+        '{"t_ns": 9000000000, "q": [1, 0, 0, 0], "note": "a brace { in a te',
+        '{"t_ns": 9000000000, "q": [1, 0, 0, 0], "note": "a \\" and a \\',
+        '{"t_ns": 9000000000, "q": [1, 0, 0, 0], "mode": {"name": "track"',
+        '{"t_ns": 9000000000, "q": [1, 0, 0, 0], "heads": [{"stars": 9}, {"stars"',
+    ],
+    ids=["a text with a brace", "an escape", "an object within", "objects within"],
+)
+def test_an_object_is_cut_within_a_text_or_an_object_of_its_own(path: Path, last: str) -> None:
+    path.write_text(lines(ROWS) + last)
+    log = open_log(path)
+    assert len(log.samples) == len(ROWS)
+    assert dict(log.told)["log-cut"].startswith("the last object has no end")
+
+
+@pytest.mark.parametrize("begun", ['{"t_ns": 9000000000, "q": [1, 0, 0, 0]', '{"note": "a"', "{"])
+def test_an_object_without_an_end_before_another_is_no_cut(path: Path, begun: str) -> None:
+    """A log that goes on was not cut off: to leave the rest out would hide an attitude."""
+    after = '{"t_ns": 10000000000, "q": [1, 0, 0, 0]}'
+    path.write_text(f"{lines(ROWS)}{begun}\n{after}\n")
+    assert f"log.json:{len(ROWS) + 1}: " in refusal(open_log, path)
 
 
 def test_zeros_and_rows_marked_invalid_are_left_out_of_an_array(path: Path) -> None:

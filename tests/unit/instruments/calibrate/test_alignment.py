@@ -27,6 +27,7 @@ from hilstar.display.identity import MonitorIdentity
 from hilstar.instruments.calibrate.alignment import (
     AxesArcsec,
     Residual,
+    _explained,
     align,
     corrected,
     groups_of,
@@ -196,6 +197,26 @@ def test_a_drift_is_named_with_its_size_though_its_ends_are_left_out(rng):
     assert {2, 61} < set(found.wild)
     (cause,) = (cause for cause in found.residual.causes if "drift" in cause)
     assert float(cause.split()[3]) == pytest.approx(200.0, rel=0.02)
+
+
+@pytest.mark.parametrize("is_across", [True, False])
+def test_a_cause_counts_by_the_scatter_of_its_own_axes(rng, is_across):
+    """A drift across the boresight explains two thirds of two axes and a noisy roll, and one of
+    the roll a third: less than half.
+    """
+    along = np.linspace(-0.5, 0.5, 60)[:, None]
+    noise_rad = np.array([1e-6, 1e-6, 1e-3])
+    drift_rad = np.array([3e-4, -2e-4, 0.0])
+    if not is_across:
+        noise_rad = np.array([1e-3, 1e-3, 1e-6])
+        drift_rad = np.array([0.0, 0.0, 3e-1])
+    residual_rad = along * drift_rad + noise_rad * rng.normal(size=(60, 3))
+    found = _explained(residual_rad, along[:, :, None] * np.eye(3))
+    if is_across:
+        assert found is not None
+        assert found[:2] == pytest.approx(drift_rad[:2], rel=0.02)
+    else:
+        assert found is None
 
 
 def test_a_late_clock_is_named_with_its_offset(rng):

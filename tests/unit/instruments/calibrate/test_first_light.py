@@ -521,7 +521,7 @@ def test_what_failed_is_never_done_and_what_needs_it_is_skipped(counted, tmp_pat
 
 def test_a_camera_that_fails_once_does_not_cost_the_images_before_it(tmp_path):
     """The third image fails until a file is there; then only it and what follows are taken, and
-    afterwards nothing is.
+    afterwards nothing is. A step that is asked for anew takes all of them.
     """
     (tmp_path / "bench.toml").write_text(bench_text())
     (tmp_path / "s").mkdir()
@@ -549,10 +549,13 @@ def test_a_camera_that_fails_once_does_not_cost_the_images_before_it(tmp_path):
 
     code, verdict, before = go()
     assert (code, verdict, sorted(before)) == (1, "failed", ["frame_0.png", "frame_1.png"])
+    code, verdict, anew = go("frames")
+    assert (code, sorted(anew)) == (1, sorted(before))
+    assert not anew.items() & before.items()
     (tmp_path / "mended").touch()
     code, verdict, after = go()
     assert (code, verdict, len(after)) == (0, "done", 4)
-    assert after.items() >= before.items()
+    assert after.items() >= anew.items()
     assert go()[2] == {}
     assert not go("frames")[2].items() & after.items()
 

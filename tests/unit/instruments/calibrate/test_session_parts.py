@@ -137,6 +137,10 @@ def test_a_step_that_was_skipped_runs_again_where_what_it_lacked_may_be_there(tm
         assert session._is_done(number) == is_done
         session.records[step.name] = record(step.name, verdict, "other")
         assert not session._is_done(number)
+    session.records[step.name] = record(step.name, "done", state)
+    # it was begun again, and killed
+    session.unfinished[step.name] = session._attempt(number)
+    assert not session._is_done(number)
 
 
 def test_figures_are_known_of_steps_that_are_done(tmp_path):

@@ -41,6 +41,7 @@ from hilstar.instruments.certify.estimates import (
     _is_better,
     _LightFit,
     _scatter,
+    light_deviation,
 )
 from hilstar.instruments.certify.model import Figures
 from hilstar.instruments.certify.structure import (
@@ -51,6 +52,7 @@ from hilstar.instruments.certify.structure import (
     Structure,
     _finer,
     _rectangle,
+    in_place,
     in_time,
     lasting_root,
     weighed,
@@ -58,6 +60,7 @@ from hilstar.instruments.certify.structure import (
 from hilstar.optics.camera import Camera
 from hilstar.server.bench.bench_file import BenchFile, bench_file_of
 from tests.support.planted_certify import BENCH, reference_star, stated_bench
+from tests.support.refusals import refusal
 
 SIZE_PX = (1920, 1080)
 ROUNDING = 1e-9
@@ -589,6 +592,17 @@ def test_black_and_light_are_both_read_more_than_once(dark, lit):
         _LightFit(LightReadings(codes, light, np.zeros(len(codes))))
 
 
+def test_white_within_the_scatter_of_black_is_no_light(tmp_path):
+    """300 above a black of four readings, whose mean is known to 258."""
+    text = BENCH.format(calibration="light.toml", delay_ms=8.0, geometry="", white=1e6)
+    file = bench_file_of(tmp_path / "bench.toml", text)
+    codes = np.array([0] * 4 + [50, 100, 150, 200, 255] * 2)
+    lit = 600.0 + 60.0 * np.arange(1, 6)
+    light = np.concatenate([[0.0, 400.0, 800.0, 1200.0], lit, lit])
+    read = LightReadings(codes, light, np.zeros(14))
+    assert "white reads no light above black" in refusal(light_deviation, file, read)
+
+
 def test_a_certificate_has_the_hashes_of_the_bench_s_files_and_of_those_that_they_name(
     tmp_path: Path,
 ) -> None:
@@ -642,3 +656,14 @@ def test_structure_that_would_have_shown_is_none_and_the_noise_is_that_of_the_re
     assert structure.total == 0.0 and not list(structure.parts())
     assert math.isinf(structure.dof)
     assert structure.noise_variance == pytest.approx(30 * (0.25 + 4) / 59)
+
+
+@pytest.mark.parametrize("axes", [1, 2])
+def test_the_noise_of_readings_in_place_is_that_of_one_along_an_axis(rng, axes):
+    """Three readings of each dot."""
+    lattice = np.meshgrid(np.arange(20.0), np.arange(15.0))
+    x, y = (np.repeat(part.ravel() * 20.0, 3) for part in lattice)
+    terms = np.ones((axes, len(x), 1))
+    found = in_place(x, y, 3.0 * rng.normal(size=(axes, len(x))), terms)
+    four_sigma = 4 * math.sqrt(2 / (axes * len(x)))
+    assert found.noise_variance == pytest.approx(9.0, rel=four_sigma)

@@ -294,6 +294,14 @@ def test_what_the_file_does_not_cover_is_said(glass_file, caplog):
         assert words in caplog.text
 
 
+def test_a_glass_of_one_point_is_the_same_all_over_the_detector_without_a_word(glass_file, caplog):
+    file = glass_file()
+    write_glass(file.folder / "psf.fits", glass_of(stack(1)))
+    psf = tracker_psf(file.config.tracker, file.folder)
+    assert isinstance(psf, GlassPsf)
+    assert "beyond" not in caplog.text
+
+
 @pytest.mark.parametrize("psf", ["glass", "gaussian"])
 def test_a_fit_of_the_psf_that_it_is_told_finds_the_chief_ray(glass_file, psf):
     """To 6e-3 px between the points of its file (measured 4.6e-3); the Gaussian sees the light

@@ -175,7 +175,9 @@ def test_a_tracker_expects_where_its_last_two_attitudes_lead_and_nothing_after_f
         live.lost_in_space = None
 
 
-@pytest.mark.parametrize(("apart_s", "is_known"), [(0.1, True), (1.0, True), (1.1, False)])
+@pytest.mark.parametrize(
+    ("apart_s", "is_known"), [(0.0, False), (0.1, True), (1.0, True), (1.1, False)]
+)
 def test_two_attitudes_tell_a_rate_up_to_a_second_apart(live, apart_s, is_known):
     rate = np.array([0.01, -0.02, 0.3])
     start = np.array([0.5, 0.5, -0.5, 0.5])

@@ -16,8 +16,9 @@ from PIL import Image
 
 from hilstar.attitude.logs.mcap_log import NO_END
 from hilstar.basics.rotation import from_rotation_vector, multiply
+from hilstar.server.bench.bench_file import bench_file_of
 from hilstar.server.bench.frame import Bench
-from hilstar.server.console.report import report, run_pictures
+from hilstar.server.console.report import _bench_file, report, run_pictures
 from hilstar.server.record.ledger import Ledger
 from hilstar.server.record.ledger_records import FaultRecord, FrameRecord
 from hilstar.server.record.run_figures import RunFigures
@@ -135,6 +136,20 @@ def test_a_bench_that_has_changed_since_draws_with_a_caution_and_one_that_is_gon
         RunFigures({"bench_text": "[monitor]\n", "bench_file": str(there)}), tmp_path / "run.mcap"
     )
     assert str(there) in gone["no_pictures"]
+
+
+def test_the_files_of_a_bench_are_those_of_its_run_else_those_beside_the_bench_file(tmp_path):
+    """Not beside the ledger, where both have changed since."""
+    text = SMALL_BENCH + '[verify]\ntrue_calibration = "truth.toml"\n'
+    paths = [tmp_path / folder / "bench.toml" for folder in ("bench", "ledger")]
+    for path in paths:
+        path.parent.mkdir()
+        (path.parent / "truth.toml").write_text(f"# in {path.parent.name}\n")
+    hashes = [bench_file_of(path, text).sha256 for path in paths]
+    head = {"bench_text": text, "bench_file": str(paths[0])}
+    for sha256, path in ((hashes[0], paths[0]), (hashes[1], paths[1]), ("another", paths[0])):
+        found = _bench_file(head | {"bench_sha256": sha256}, paths[1].with_name("run.mcap"))
+        assert found.path == path
 
 
 def test_of_a_ledger_that_was_cut_off_what_is_whole_is_reported_and_the_page_says_so(

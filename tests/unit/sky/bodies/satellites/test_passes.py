@@ -112,6 +112,39 @@ def test_whichever_way_time_goes_a_fixed_observer_misses_none_along_an_axis(step
     assert found > 5
 
 
+@pytest.mark.parametrize("leaves", [True, False], ids=["leaves", "enters"])
+def test_a_satellite_is_seen_on_the_lit_side_of_a_shadow_s_edge_after_a_look_on_the_other(
+    rng, leaves
+):
+    """Two seconds before it leaves the shadow, or one after it has entered it; what is looked up
+    is kept for three.
+    """
+    text = some_orbits(rng, 5)
+    orbit = TleOrbit("\n".join(text.splitlines()[:3]), "f")
+    # of the middle of the search: the shadow's edge is known to half a second
+    sun_km = satellite_sky(text, Geocentre()).passing(EVERYWHERE, 3000 * S_NS).now.sun_km
+
+    def is_lit(second: int) -> bool:
+        place_km = orbit.state(START + second * S_NS)[0]
+        return bool(sunlit_share(place_km[None], sun_km)[0] > 0)
+
+    step_s = 30
+    begin_s = next(
+        second
+        for second in range(0, 6000, step_s)
+        if is_lit(second) is not leaves and is_lit(second + step_s) is leaves
+    )
+    edge_s = next(second for second in range(begin_s, 6000) if is_lit(second) is leaves)
+    dark_s, lit_s = (edge_s - 2, edge_s + 1) if leaves else (edge_s + 1, edge_s - 2)
+    sky = satellite_sky(text, Geocentre())
+    cone = Cone(NORTH, np.pi, 0.1)
+    for second in (dark_s, lit_s):
+        seen = sky.passing(cone, second * S_NS)
+        now = np.zeros(len(seen))
+        rates = seen.rates_e_per_s(np.arange(len(seen)), now, now)
+        assert (0 in seen.index[rates > 0]) is (second == lit_s)
+
+
 @pytest.mark.parametrize(
     ("fewer", "more"),
     [

@@ -110,7 +110,7 @@ def test_each_count_is_judged_turning_against_still_and_beside_numba(measured):
 @pytest.mark.timing
 def test_stages_make_up_the_whole_frame():
     counts = (100, 1000)
-    plan = replace(benchmark.QUICK, counts=counts, starts=1, rounds=8, exposures=0)
+    plan = replace(benchmark.QUICK, counts=counts, starts=1, exposures=0)
     result = benchmark.run(plan, np.random.default_rng(1), lambda cells_done: None)
     for count in counts:
         # The minimum: what else the machine has to do is in the median.

@@ -764,10 +764,10 @@ def delimiter_of(lines: Sequence[str], counts_of: CountsOf) -> str:
     best_rank = (0, 0.0, 0)
     rows = [line for line in lines if line.strip() and not _is_comment(line)]
     for delimiter in DELIMITERS:
-        counts = [counts_of(line, delimiter) for line in rows]
-        count = counts[0].cells
+        count = counts_of(rows[0], delimiter).cells
         if count < 2:
             continue
+        counts = [counts_of(line, delimiter) for line in rows]
         alike = [row for row in counts if row.cells == count]
         filled = sum(row.filled for row in alike)
         numbers = sum(row.numbers for row in alike)

@@ -81,21 +81,22 @@ class Spread:
     square: float = 0.0
     dof: float = 0.0
 
-    def likelihood(self, ratio: float) -> tuple[float, float]:
-        """The logarithm of the restricted likelihood of a ratio of variances, and the noise's
-        variance by it.
+    def likelihoods(self, ratios: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The logarithm of the restricted likelihood of each ratio of variances (r,), and the
+        noise's variance by it.
         """
-        weight = 1 / (1 + ratio * self.eigen)
-        weighted = weight[:, None] * self.terms
+        weight = 1 / (1 + ratios[:, None] * self.eigen)
+        weighted = weight[:, :, None] * self.terms
         normal = self.terms.T @ weighted
-        towards = weighted.T @ self.value
-        explained = towards @ np.linalg.solve(normal, towards)
-        total = self.value @ (weight * self.value)
-        unexplained = float(total - explained) + self.square
+        towards = weighted.transpose(0, 2, 1) @ self.value
+        solved = np.linalg.solve(normal, towards[:, :, None])
+        explained = (towards * solved[:, :, 0]).sum(axis=1)
+        total = (weight * self.value) @ self.value
+        unexplained = total - explained + self.square
         dof = len(self.value) - self.terms.shape[1] + self.dof
         _, log_of_normal = np.linalg.slogdet(normal)
-        sizes = float(log_of_normal - np.log(weight).sum())
-        of_noise = dof * math.log(max(unexplained, TINY))
+        sizes = log_of_normal - np.log(weight).sum(axis=1)
+        of_noise = dof * np.log(np.maximum(unexplained, TINY))
         return -0.5 * (sizes + of_noise), unexplained / dof
 
 
@@ -104,9 +105,10 @@ def weighed(lengths: FloatArray, spreads: list[Spread]) -> Structure:
     likelihood = np.zeros((len(lengths), len(RATIOS)))
     noise = np.zeros_like(likelihood)
     for row, spread in enumerate(spreads):
-        for column, ratio in enumerate(RATIOS):
-            likelihood[row, column], noise[row, column] = spread.likelihood(ratio)
-    none, noise_of_none = spreads[0].likelihood(0.0)  # the same for all lengths
+        likelihood[row], noise[row] = spread.likelihoods(RATIOS)
+    # the same for all lengths
+    of_none, noises_of_none = spreads[0].likelihoods(np.zeros(1))
+    none, noise_of_none = float(of_none[0]), float(noises_of_none[0])
     finer = _finer(lengths, FINE_LENGTH), _finer(RATIOS, FINE_RATIO)
     of_some = _between(lengths, likelihood, finer)
     log_noise = np.log(np.maximum(noise, TINY))

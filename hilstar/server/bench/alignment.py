@@ -6,7 +6,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import integrate, optimize, stats
+from scipy import integrate, optimize
+from scipy.special import stdtrit
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.rotation import (
@@ -63,7 +64,7 @@ def cube_to_boresight(
         covariance = to_cam @ np.array(settings.covariance_arcsec2) @ to_cam.T
         factor = 1.0
         if settings.dof is not None:
-            factor = float(stats.t.ppf(0.975, settings.dof)) / HALF_OF_95
+            factor = float(stdtrit(settings.dof, 0.975)) / HALF_OF_95
         covariance = covariance * factor**2
         if certificate is None or certificate.attitude_arcsec is None:
             without.append("the bench's own (no certificate states it)")
@@ -100,10 +101,11 @@ def radius_of_95(covariance: FloatArray) -> float:
     def held(radius: float) -> float:
         """The probability within a radius, in units of the larger sigma."""
 
+        # a thousandth of the time of scipy.stats' distributions, which are asked 3000 times
         def at(u: float) -> float:
             room = math.sqrt(max(radius**2 - u**2, 0.0))
-            across = 1.0 if ratio < SAME else 2 * float(stats.norm.cdf(room / ratio)) - 1
-            return float(stats.norm.pdf(u)) * across
+            across = 1.0 if ratio < SAME else math.erf(room / ratio / math.sqrt(2))
+            return math.exp(-(u**2) / 2) / math.sqrt(2 * math.pi) * across
 
         return float(integrate.quad(at, -radius, radius)[0])
 

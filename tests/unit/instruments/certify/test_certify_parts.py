@@ -303,10 +303,9 @@ def test_a_restricted_likelihood_is_that_of_contrasts(ratio, rng):
         return -0.5 * (log_size + free * math.log(unexplained)), unexplained / free
 
     spread = Spread(eigen, value, design)
-    likelihood, noise = spread.likelihood(ratio)
-    at_zero, _ = spread.likelihood(0.0)
+    (likelihood, at_zero), noises = spread.likelihoods(np.array([ratio, 0.0]))
     wanted, wanted_noise = by_contrasts(ratio)
-    assert noise == pytest.approx(wanted_noise)
+    assert noises[0] == pytest.approx(wanted_noise)
     # up to a constant of the terms, the same for all ratios
     assert likelihood - at_zero == pytest.approx(wanted - by_contrasts(0.0)[0], abs=1e-9)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import closing
 
 import pytest
 import zmq
@@ -103,11 +104,10 @@ def test_what_this_process_took_before_the_link_was_used_is_not_the_link_s(tmp_p
 @pytest.mark.parametrize(("bind", "openings"), [(False, 2), (True, 0)])
 def test_connections_of_a_reading_process_are_openings_where_the_link_makes_them(bind, openings):
     """After each opening a link's messages are read anew; who connects to it ends none of them."""
-    with ZmqRoad("tcp://127.0.0.1:*" if bind else "tcp://127.0.0.1:5560", bind=bind) as road:
-        apart = ZmqRoadApart(road)
+    road = ZmqRoad("tcp://127.0.0.1:*" if bind else "tcp://127.0.0.1:5560", bind=bind)
+    with road, closing(ZmqRoadApart(road)) as apart:
         apart._count(LinkCounts(connections=2))
         assert apart.openings == openings
-        apart.close()
 
 
 def test_a_place_that_cannot_be_bound_is_refused_with_what_to_do(tmp_path):

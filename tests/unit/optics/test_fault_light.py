@@ -163,6 +163,22 @@ def test_a_map_s_brightest_pixel_has_the_light_that_is_said_or_its_own(tmp_path,
     assert found.times * found.image.max() == pytest.approx(brightest * 0.4**2, rel=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("frame", "lit_px", "brightest"),
+    [("tracker", 250 * 150, 8.0 * 0.4**2), ("screen", 320 * 240, 8.0)],
+)
+def test_a_map_lies_over_the_whole_of_the_tracker_s_image_or_of_the_screen(
+    tmp_path, frame, lit_px, brightest
+):
+    """A tracker pixel is 2.5 monitor pixels on a side."""
+    np.save(tmp_path / "stray.npy", np.array([[2.0, 4.0], [8.0, 6.0]]))
+    fault = fault_of({"kind": "light-map", "name": "x", "file": "stray.npy", "frame": frame})
+    view = FaultView(view_of().by, 7, folder=tmp_path)
+    (found,) = view.surfaces([Now(1, fault, 0, 1.0)], np.array([1.0, 0.0, 0.0, 0.0]))
+    assert np.count_nonzero(found.image) == pytest.approx(lit_px, rel=0.02)
+    assert found.times * found.image.max() == pytest.approx(brightest, rel=1e-3)
+
+
 def test_of_more_maps_than_are_kept_the_one_used_longest_ago_goes(monkeypatch):
     """But for those that last."""
     monkeypatch.setattr(fault_light, "KEPT_MAPS", 2)

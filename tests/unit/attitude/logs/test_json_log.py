@@ -82,6 +82,17 @@ def test_objects_and_their_places_are_the_same_wherever_a_piece_of_a_line_ends(
         assert [place for place, _ in objects] == places
 
 
+def test_a_line_of_no_object_is_one_text_wherever_its_pieces_end() -> None:
+    """It is refused once, with its line."""
+    lines = ["attitude: none yet\n", '{"t_ns": 1}\n']
+    for size in (*range(1, 20), 1000):
+        pieces = []
+        for line in lines:
+            pieces += [line[begin : begin + size] for begin in range(0, len(line), size)]
+        found = list(JsonObjects().split(pieces))
+        assert found == [(":1", "attitude: none yet"), (":2", '{"t_ns": 1}')]
+
+
 def test_an_array_that_was_cut_off_between_objects_is_read_and_that_is_said(path: Path) -> None:
     path.write_text(json.dumps(ROWS)[:-1])
     log = open_log(path)

@@ -170,6 +170,22 @@ def test_so_they_do_where_light_beside_stars_comes_and_goes(rng, monkeypatch):
     assert_same_codes("round", *both_ways(target, frames, monkeypatch))
 
 
+@pytest.mark.parametrize("quantisation", ["exact", "temporal"])
+def test_so_they_do_of_light_without_stars_whose_mask_turns_where_frames_follow(
+    quantisation, rng, monkeypatch
+):
+    """A mask that stays would show each frame's rounding in the mean of all."""
+    glow = LightMap(rng.uniform(1e3, 3e4, (40, 50)).astype(np.float32), (30, 20))
+    frames = [replace(stars_or_paths(0, USUAL, rng), extended=(glow,)) for _ in range(3)]
+    target = Target(SIZE, GaussianPsf(USUAL), SRGB8, WHITE, quantisation)
+    on_cpu, by_points = both_ways(target, frames, monkeypatch)
+    for first, second in zip(on_cpu, by_points, strict=True):
+        assert np.count_nonzero(first) > 1000
+        assert np.count_nonzero(first != second) < 10  # near a threshold, by a driver's exp2
+    turns = np.count_nonzero(on_cpu[0] != on_cpu[1]) > 500
+    assert turns == (quantisation == "temporal")
+
+
 @pytest.mark.parametrize("smaller", [False, True], ids=["whole", "smaller sprites"])
 @pytest.mark.parametrize("sigma_px", [(0.4, 0.4), USUAL, (1.2, 0.8)])
 def test_no_frame_of_temporal_leaves_a_pixel_behind(sigma_px, smaller, rng):

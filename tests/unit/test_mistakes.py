@@ -227,6 +227,39 @@ def test_rotations_take_lists_scipy_and_quantities():
     assert by_quantity == pytest.approx(rotation.propagate(q, np.radians([0, 0, 1]), 2), abs=1e-15)
 
 
+TURN_RAD = [0.1, -0.2, 0.3]
+
+
+@pytest.mark.parametrize(
+    ("function", "given", "plain"),
+    [
+        (
+            rotation.direction_of,
+            ([5, 6] * u.hourangle, [-72, 30] * u.arcmin),
+            ([75, 90], [-1.2, 0.5]),
+        ),
+        (rotation.frame_turns, (2, [30, -200] * u.mrad), (2, [0.03, -0.2])),
+        (rotation.from_rotation_vector, (np.degrees(TURN_RAD) * u.deg,), (TURN_RAD,)),
+        (rotation.from_rotation_vectors, (np.degrees([TURN_RAD]) * u.deg,), ([TURN_RAD],)),
+        (rotation.rotate, (Q, [[30, 20, 10]] * u.percent), (Q, [[0.3, 0.2, 0.1]])),
+        (rotation.slerp, (Q, Q[::-1], 25 * u.percent), (Q, Q[::-1], 0.25)),
+        (rotation.rate_between_rad_s, (Q, Q[::-1], 20 * u.ms), (Q, Q[::-1], 0.02)),
+        (
+            rotation.propagate,
+            (Q, [9, 0, 3] * u.deg / u.s, 1 * u.min),
+            (Q, np.radians([9, 0, 3]), 60),
+        ),
+        (
+            rotation.from_radec_roll_deg,
+            (5 * u.hourangle, -72 * u.arcmin, 0.5 * u.rad),
+            (75, -1.2, np.degrees(0.5)),
+        ),
+    ],
+)
+def test_a_quantity_is_what_its_number_in_the_parameter_s_unit_is(function, given, plain):
+    assert function(*given) == pytest.approx(function(*plain), abs=1e-14)
+
+
 def test_a_name_that_hilstar_lacks_is_answered_with_the_nearest():
     with pytest.raises(AttributeError, match="no attribute 'Sendr'; did you mean Sender"):
         _ = hilstar.Sendr

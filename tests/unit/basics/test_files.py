@@ -78,6 +78,17 @@ def test_what_a_bench_file_names_is_an_input_too(tmp_path):
     }
 
 
+def test_a_plan_s_inputs_go_down_to_the_tables_of_its_bench_s_calibration(tmp_path):
+    """A TOML file below those is an input too, but what it names is not looked for: a ring ends."""
+    (tmp_path / "plan.toml").write_text('bench = "bench.toml"\n')
+    (tmp_path / "bench.toml").write_text('[monitor]\ncalibration = "m.toml"\n')
+    (tmp_path / "m.toml").write_text('response = "m.csv"\nfurther = "next.toml"\n')
+    (tmp_path / "next.toml").write_text('again = "plan.toml"\n')
+    (tmp_path / "m.csv").write_text("")
+    names = [path.name for path in files_named_in(tmp_path / "plan.toml")]
+    assert names == ["plan.toml", "bench.toml", "m.toml", "m.csv", "next.toml"]
+
+
 def test_an_error_leaves_the_older_file_whole_and_nothing_beside(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text("old")

@@ -443,6 +443,35 @@ def test_what_cannot_be_shown_is_named_with_its_loss():
     ).all()
 
 
+def test_a_star_loses_the_share_of_the_primaries_that_do_not_show_it():
+    panel = Panel(srgb_response(8), WHITE)
+    shares = np.array([0.25, 0.75])
+    primaries = tuple(Panel(panel.response, share * WHITE) for share in shares)
+    sprites = sprites_at(60.3, 30.6, flux_of(1.0))
+    levels = exact(sprites, panel)
+    dark = np.zeros_like(levels)
+    for is_lit in ([True, True], [True, False], [False, True]):
+        shown = np.stack([levels if lit else dark for lit in is_lit], axis=-1)
+        loss_mag = star_losses_mag(
+            sprites,
+            replace(panel, primaries=primaries),
+            FootprintMap(FIELD, GaussianPsf(SIGMA)),
+            shown,
+        )
+        assert loss_mag == pytest.approx(-2.5 * np.log10(shares[is_lit].sum()), abs=FLUX_MAG)
+
+
+def test_a_star_in_a_dark_part_of_the_panel_loses_what_is_not_made_up_for():
+    panel = Panel(srgb_response(8), WHITE)
+    uneven = np.ones(FIELD[::-1], np.float32)
+    uneven[:, FIELD[0] // 2 :] = 0.8
+    sprites = sprites_at([40.3, 120.3], [30.6, 30.6], flux_of(1.0))
+    footprints = FootprintMap(FIELD, GaussianPsf(SIGMA))
+    seen = replace(panel, uniformity=uneven)
+    loss_mag = star_losses_mag(sprites, seen, footprints, exact(sprites, panel))
+    assert loss_mag == pytest.approx([0.0, -2.5 * np.log10(0.8)], abs=FLUX_MAG)
+
+
 def test_a_star_within_a_brighter_one_loses_what_that_one_does():
     panel = Panel(srgb_response(8), WHITE)
     # As alpha Centauri B within A: every pixel of its own is A's.

@@ -122,6 +122,22 @@ def test_a_mode_transform_or_path_that_changes_frames_is_told_with_what_mends_it
     assert words in finding.text and finding.refused == refused
 
 
+def test_a_ledger_has_of_an_output_what_may_change_its_frames():
+    state = replace(
+        PLAIN,
+        mode_px=(1280, 720),
+        transform=(0.8, 0, 0, 0, 0.8, 0, 0, 0, 1),
+        rotated=True,
+        properties={"TearFree": "on"},
+        others=("HDMI-1",),
+        providers=("Intel", "NVIDIA-0"),
+    )
+    known = state.fields()
+    for name in {*known} - {"size_mm"}:
+        assert known[name] == getattr(state, name)
+    assert replace(PLAIN, properties=None).fields()["properties"] == {}
+
+
 def test_a_plain_output_has_no_findings_nor_one_without_a_preferred_mode():
     assert not list(findings(PLAIN, 8, 277.0))
     assert not list(findings(replace(PLAIN, transform=(1, 0, 0, 0, 1, 0, 0, 0, 1)), 8))

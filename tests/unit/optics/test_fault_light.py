@@ -133,6 +133,52 @@ def test_stray_light_is_kept_as_one_object_and_has_the_share_of_its_frame():
     assert whole_glow.direction_image == pytest.approx(direction / np.linalg.norm(direction))
 
 
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {"kind": "false-star", "tracker_px": [10.0, 12.0]} | LIGHT,
+        {"kind": "flash", "tracker_px": [10.0, 12.0], "for_s": 1.0} | LIGHT,
+        {"kind": "gradient"} | LIGHT,
+        {"kind": "glow", "tracker_px": [10.0, 12.0]} | LIGHT,
+        {"kind": "light-map", "file": "stray.npy"} | LIGHT,
+    ],
+    ids=lambda keys: keys["kind"],
+)
+def test_light_without_a_colour_has_the_sun_s(keys):
+    """B-V = 0.65 (Ramirez et al. 2012, ApJ 752, 5: 0.653)."""
+    assert fault_of(keys).bv_mag == 0.65
+    assert fault_of(keys | {"bv_mag": -0.2}).bv_mag == -0.2
+
+
+@pytest.mark.parametrize(
+    ("light", "brightest"),
+    [({}, 8.0), ({"electrons_per_s": 50.0}, 50.0), ({"electrons": 50.0}, 50.0 / EXPOSURE_S)],
+)
+def test_a_map_s_brightest_pixel_has_the_light_that_is_said_or_its_own(tmp_path, light, brightest):
+    """Electrons per second in a tracker pixel, of which a monitor pixel has 0.4 by 0.4."""
+    np.save(tmp_path / "stray.npy", np.array([[2.0, 4.0], [8.0, 6.0]]))
+    fault = fault_of({"kind": "light-map", "name": "x", "file": "stray.npy"} | light)
+    view = FaultView(view_of().by, 7, folder=tmp_path)
+    (found,) = view.surfaces([Now(1, fault, 0, 1.0)], np.array([1.0, 0.0, 0.0, 0.0]))
+    assert found.times * found.image.max() == pytest.approx(brightest * 0.4**2, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("frame", "lit_px", "brightest"),
+    [("tracker", 250 * 150, 8.0 * 0.4**2), ("screen", 320 * 240, 8.0)],
+)
+def test_a_map_lies_over_the_whole_of_the_tracker_s_image_or_of_the_screen(
+    tmp_path, frame, lit_px, brightest
+):
+    """A tracker pixel is 2.5 monitor pixels on a side."""
+    np.save(tmp_path / "stray.npy", np.array([[2.0, 4.0], [8.0, 6.0]]))
+    fault = fault_of({"kind": "light-map", "name": "x", "file": "stray.npy", "frame": frame})
+    view = FaultView(view_of().by, 7, folder=tmp_path)
+    (found,) = view.surfaces([Now(1, fault, 0, 1.0)], np.array([1.0, 0.0, 0.0, 0.0]))
+    assert np.count_nonzero(found.image) == pytest.approx(lit_px, rel=0.02)
+    assert found.times * found.image.max() == pytest.approx(brightest, rel=1e-3)
+
+
 def test_of_more_maps_than_are_kept_the_one_used_longest_ago_goes(monkeypatch):
     """But for those that last."""
     monkeypatch.setattr(fault_light, "KEPT_MAPS", 2)

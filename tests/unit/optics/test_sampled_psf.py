@@ -12,7 +12,13 @@ import pytest
 from astropy.io import fits
 
 from hilstar.basics.errors import InputError
-from hilstar.optics.psf import MAX_SAMPLED_CUT, GaussianPsf, SampledPsf, read_psf
+from hilstar.optics.psf import (
+    MAX_SAMPLED_CUT,
+    GaussianPsf,
+    SampledPsf,
+    read_psf,
+    square_points,
+)
 from tests.support.claims import holds
 from tests.support.psfs import airy, coma, gaussian, in_pixels, sampled
 
@@ -357,3 +363,19 @@ def test_a_look_at_a_share_copies_no_table():
         tracemalloc.stop()
     # a table of this footprint has 20 rows a px, of four bytes a share
     assert peak_bytes < (20 * psf.footprint_px) ** 2 * 4 / 10
+
+
+@pytest.mark.parametrize(
+    ("psf", "side_px"),
+    [
+        *((GaussianPsf((0.7, 0.9)), side_px) for side_px in (0.4, 1.0, 3.0, 20.0)),
+        (SampledPsf(sampled(gaussian(0.8, 0.8), 8, 5), 8), 1.0),
+    ],
+)
+def test_the_points_of_a_square_have_its_middle_and_its_variance(psf, side_px):
+    """An even square of side a has a^2 / 12 along each axis."""
+    points, each = square_points(side_px, psf)
+    assert points == pytest.approx(-points[::-1], abs=1e-12)
+    blur_px2 = np.subtract(each.variance_px2, psf.variance_px2)
+    found_px2 = side_px**2 * np.mean(points**2) + blur_px2
+    assert found_px2 == pytest.approx(side_px**2 / 12, rel=1e-2)

@@ -154,6 +154,18 @@ def test_a_turn_beyond_what_a_frame_draws_takes_a_satellite_where_it_takes_the_s
     assert np.hypot(*np.subtract(*places)) < 3
 
 
+@pytest.mark.parametrize("passes_s", [-0.07, 0.06])
+def test_a_satellite_that_a_turn_brings_into_an_exposure_and_out_of_it_is_drawn(passes_s):
+    """The field is 2 degrees to a corner, and at the attitude's own moment it is beyond that."""
+    one = scene()
+    rate = np.radians((0.0, 120.0, 0.0))
+    away = replace(one, q=propagate(one.q, rate, -passes_s))
+    light, _ = away.light(View.exposure(away.q, rate, 0.2, away.t_ns))
+    assert not (0 < away.place_px(rate, 0.0)[0] < SIZE_PX[0])
+    wanted = away.mean_light(rate, passes_s - 0.02, 0.04).sum() * 0.04 / 0.2
+    assert linear_image(light, SIZE_PX, PSF).sum() == pytest.approx(wanted, rel=0.1)
+
+
 def test_satellites_fainter_than_the_faintest_are_neither_drawn_nor_written():
     one = scene()
     view = View.exposure(one.q, RATE, 0.05, one.t_ns)

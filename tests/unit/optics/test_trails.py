@@ -383,18 +383,20 @@ def test_a_star_behind_a_disc_loses_the_share_of_the_time_of_each_place_that_hid
     assert hidden(stars, directions, whole).star.tolist() == [1, 3, 4]
 
 
-def test_the_places_of_a_disc_hide_together_what_the_one_in_the_middle_hides():
+@pytest.mark.parametrize("poses", [1, 5])
+def test_the_places_of_a_disc_hide_together_what_the_one_in_the_middle_hides(poses):
     """A disc of some 20 px along 40 px of the image, before an even light of 1."""
     sky, t_ns = lit_moment(LIST, "norad,size_m\n7,12000\n")
     seen = sky.passing(Cone(NORTH, np.pi, 0.0), t_ns).only(np.array([0]))
     q = looking_at(seen.directions(slice(None), np.zeros(1))[0])
     view = TrailView(CAMERA, to_matrix(q), np.array([0.0, 0.1, 0.0]))
     lit = Lit(np.array([-0.07]), 0.14)
-    trail = disc_trail(seen, "wide", view, lit, Brush(BRUSH.psf, 2000, poses=5))
-    assert len(trail.along) == 5
+    trail = disc_trail(seen, "wide", view, lit, Brush(BRUSH.psf, 2000, poses=poses))
+    assert len(trail.along) == poses
     (covering,) = (light for light in trail.lights if getattr(light, "covers", False))
     even = LightMap(np.ones(SIZE_PX[::-1], np.float32))
-    covered = 1 - extended_image((even, covering), SIZE_PX)
+    behind = extended_image((even, covering), SIZE_PX) - extended_image((covering,), SIZE_PX)
+    covered = 1 - behind
     x_px, y_px = (float(place[0]) for place in view.places_px(seen, slice(None), np.zeros(1)))
     rows, columns = np.indices(covered.shape)
     # the disc's edge by five rays a pixel

@@ -125,6 +125,22 @@ def test_light_of_a_v_magnitude_has_its_mean_through_v_by_energy_or_by_photons(i
     assert abs(means[0] / means[1] - 1) > 1e-3
 
 
+def test_the_night_sky_glows_more_towards_the_horizon_and_not_from_the_ground():
+    """Krisciunas and Schaefer 1991, PASP 103, 1033, equations 2 and 3."""
+    altitude = np.radians([90.0, 30.0, 5.0, -0.01, -30.0])
+    directions = np.stack([np.cos(altitude), np.zeros(5), np.sin(altitude)], axis=1)
+    zenith_e_per_s_sr = np.array([8.0, 2.0])
+    air = replace(
+        plain_air(np.array([0.0, 0.0, 1.0]), (0.1, 0.2)),
+        v_extinction_mag=0.17,
+        glow_e_per_s_sr=zenith_e_per_s_sr,
+    )
+    masses = (1 - 0.96 * np.cos(altitude) ** 2) ** -0.5
+    wanted = masses * 10 ** (-0.4 * 0.17 * (masses - 1))
+    wanted[3:] = 0.0
+    assert air.glow_at(directions, 0) == pytest.approx(np.outer(zenith_e_per_s_sr, wanted))
+
+
 def test_a_curve_with_another_s_knots_is_the_same_curve_to_both_ends_of_a_range():
     """The ends are knots, too: outside of its knots a curve is nothing."""
     curve = Curve(np.array([300.0, 500.0, 900.0]), np.array([0.1, 0.9, 0.5]))

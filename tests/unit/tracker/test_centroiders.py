@@ -80,6 +80,12 @@ def test_a_star_that_is_off_along_one_axis_alone_is_followed_to_its_place(place_
     assert (x[0], y[0]) == pytest.approx(place_px, abs=BIAS_PX["psf"])
 
 
+def test_where_noise_takes_a_star_s_light_away_a_fit_by_the_psf_stays_at_its_first_place():
+    first = (np.array([0.4]), np.array([-0.7]))
+    dark = -gaussian_images(np.array([[0.9], [-0.2]]))
+    assert psf_places(dark, lambda *places: gaussian_images(np.stack(places)), first) == first
+
+
 def test_a_fit_ends_at_the_star_that_it_begins_at():
     """Of two that are as bright, three pixels up and down from the middle, and a pixel aside."""
     two = np.array([[1.0, -1.0], [-3.0, 3.0]])

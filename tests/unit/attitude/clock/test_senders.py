@@ -57,6 +57,10 @@ class Shown:
         self._note(self.senders.expire(host_ns))
         return self
 
+    def release(self) -> Shown:
+        self._note(self.senders.release())
+        return self
+
     def run(self, count: int, first: int = 0) -> Shown:
         """So many messages of one sender, one each PERIOD_NS."""
         for k in range(first, first + count):
@@ -162,6 +166,28 @@ def test_another_named_sender_is_shown_once_the_first_is_silent(by, silent_ns, w
     # then the other way round
     shown.take(message_of(FIRST, by, 20, host_ns + PERIOD_NS))
     assert (shown.sequences[-1] == 20) == (not is_shown)
+
+
+@pytest.mark.parametrize("others", [0.0, 0.1])
+@pytest.mark.parametrize("seed", range(3))
+def test_every_message_is_shown_or_refused_once_whoever_sends_and_pauses(others, seed):
+    """Two named senders with three counters each, and pauses after which another one is shown."""
+    rng = np.random.default_rng(seed)
+    shown, host_ns, sent = Shown(), HOST0_NS, []
+    for k in range(600):
+        is_pause = rng.random() < 0.1
+        host_ns += STALE_AFTER_NS + 1 if is_pause else PERIOD_NS
+        who = OTHER if rng.random() < others else FIRST
+        sequence = k + 10_000 * int(rng.integers(3))
+        sent.append(sequence)
+        t_ns = host_ns - PERIOD_NS * int(rng.integers(3))  # some have another's time
+        message = sample_message(sequence, t_ns, host_ns)
+        shown.take(replace(message, event=replace(message.event, sender=who)))
+        if rng.random() < 0.1:
+            shown.expire(host_ns + STALE_AFTER_NS)
+    shown.release()
+    refused = [sequence for sequence, _ in shown.refused]
+    assert sorted([*shown.sequences, *refused]) == sorted(sent)
 
 
 def test_a_sender_that_states_no_number_is_named_so_beside_one_that_does():

@@ -216,6 +216,17 @@ def test_a_spin_that_its_attitudes_tell_has_no_rate_of_its_own(tmp_path):
     assert second.rate_cam_rad_s is None
 
 
+def test_a_spin_has_its_rates_where_one_step_alone_is_more_than_a_quarter_turn(tmp_path):
+    """1.75 s and 0.25 s at -109.97 deg/s."""
+    spin = [268.62511, 68.448486, 159.69509, -109.96528]
+    rows = rows_of(spin, spin)
+    rows.append(rows[1].replace(EPOCHS[1], "2024-03-01T00:00:01.25"))
+    meta = keywords("1.0", "ICRF", "A2B", None, ATTITUDE_TYPE="SPIN")
+    meta["STOP_TIME"] = "2024-03-01T00:00:02"
+    for sample in read(tmp_path, kvn(rows, **meta)):
+        assert np.linalg.norm(sample.rate_cam_rad_s) == pytest.approx(np.radians(109.96528))
+
+
 # XML
 
 

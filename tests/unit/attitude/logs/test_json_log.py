@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from hilstar.attitude.logs.json_lines import JsonObjects
 from hilstar.attitude.logs.log_file import open_log
 from hilstar.attitude.logs.telemetry import read_telemetry
 from hilstar.basics.errors import InputError
@@ -59,6 +60,38 @@ def test_an_array_may_be_longer_than_any_line_of_a_table(path: Path) -> None:
     assert len(text) > MAX_LINE_CHARACTERS
     path.write_text(text)
     assert [sample.sequence for sample in open_log(path).samples] == list(range(count))
+
+
+@pytest.mark.parametrize(
+    ("form", "places"),
+    [
+        ("array", [":1, object 1", ":1, object 2", ":1, object 3", ":1, object 4"]),
+        ("lines with commas", [":1", ":2", ":3", ":4"]),
+        ("indented array", [":2, object 1", ":12, object 2", ":22, object 3", ":32, object 4"]),
+    ],
+)
+def test_objects_and_their_places_are_the_same_wherever_a_piece_of_a_line_ends(
+    form: str, places: list[str]
+) -> None:
+    """A note has braces, quotes and a backslash, so that a piece may end before any of them."""
+    for size in (*range(1, 60), 1000):
+        pieces = []
+        for line in FORMS[form].splitlines(keepends=True):
+            pieces += [line[begin : begin + size] for begin in range(0, len(line), size)]
+        objects = list(JsonObjects().split(pieces))
+        assert [json.loads(text) for _, text in objects] == ROWS
+        assert [place for place, _ in objects] == places
+
+
+def test_a_line_of_no_object_is_one_text_wherever_its_pieces_end() -> None:
+    """It is refused once, with its line."""
+    lines = ["attitude: none yet\n", '{"t_ns": 1}\n']
+    for size in (*range(1, 20), 1000):
+        pieces = []
+        for line in lines:
+            pieces += [line[begin : begin + size] for begin in range(0, len(line), size)]
+        found = list(JsonObjects().split(pieces))
+        assert found == [(":1", "attitude: none yet"), (":2", '{"t_ns": 1}')]
 
 
 def test_an_array_that_was_cut_off_between_objects_is_read_and_that_is_said(path: Path) -> None:

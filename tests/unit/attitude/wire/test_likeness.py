@@ -104,6 +104,8 @@ MESSAGES = {
     "UTF-8": ("Lagequaternion für Kamera".encode(), "text, 'Lagequaternion"),
     "UTF-16": ("t_ns 12".encode("utf-16"), "UTF-16 text"),
     "UTF-16 without its mark": ("t_ns".encode("utf-16-le"), "UTF-16 text"),
+    "UTF-16 of the other order": (b"\xfe\xff" + "t_ns".encode("utf-16-be"), "UTF-16 text"),
+    "numbers of 16 bits": (struct.pack("<4H", 1, 0, 7, 0), "binary, 01 00 00 00 07 00 00 00"),
     "topic before JSON": (b'attitude {"t_ns": 1, "q": [1,0,0,0]}', "a part of its own"),
     "JSON array": (b'[{"t_ns": 1, "q": [1,0,0,0]}]', "one object for each attitude"),
     "pickle": (pickle.dumps({"t_ns": 1, "q": list(Q)}), "a Python pickle"),

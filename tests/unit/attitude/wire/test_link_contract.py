@@ -19,6 +19,7 @@ from hilstar.attitude.wire.links import (
     MAX_PACKETS_PER_S,
     Arrival,
     FloodGate,
+    PacketDecoder,
     StreamLink,
     pieces,
 )
@@ -326,6 +327,13 @@ def test_of_the_messages_in_a_chunk_only_the_last_may_not_have_waited():
         chunk = RawMessage(70, [b"ab"], 50, timely)
         waited_ns = [message.waited_ns for message in pieces(chunk, [b"a", b"b"])]
         assert waited_ns == [20, 0 if timely else 20]
+
+
+@pytest.mark.parametrize("decoder", [PacketDecoder(), FedDecoder()], ids=["packets", "fed"])
+def test_what_a_message_holds_may_have_waited_as_long_as_the_message(decoder):
+    packet = attitude_packet(3, jump=False)
+    messages = [RawMessage(70, [packet], 50, timely=False), RawMessage(90, [packet], 60)]
+    assert [arrival.waited_ns for arrival in decoder.arrivals(messages)] == [20, 0]
 
 
 def test_a_fed_message_has_the_time_that_stands_before_it_and_any_other_its_own():

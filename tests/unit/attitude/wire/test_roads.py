@@ -706,9 +706,14 @@ def test_of_several_orders_the_newest_is_carried_out_with_its_device():
         assert os.read(file, 100) == b"the device"
         os.close(file)
         reader._wire = None
+        wire.put(Record())
         ours.close()
+        # what was never read resets the line, before its end is seen
+        for _ in ("reset", "end"):
+            with pytest.raises(EOFError):
+                wire.order(1000)
         with pytest.raises(EOFError):
-            wire.order(1000)
+            wire.put(Record())
     os.close(reading)
     os.close(writing)
     reader.close()

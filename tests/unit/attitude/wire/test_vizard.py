@@ -18,10 +18,12 @@ from scipy.spatial.transform import Rotation
 from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.wire.links import Arrival, TrackerCamera
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, Status
+from hilstar.attitude.wire.roads import RawMessage
 from hilstar.attitude.wire.source import CHECK_RADEC_DEG, Mounting
 from hilstar.attitude.wire.vizard import (
     CONVENTIONS,
     MAX_HELD_NS,
+    BroadcastDecoder,
     DifferenceRates,
     Follower,
     Opening,
@@ -201,6 +203,18 @@ def test_what_is_held_back_waits_by_the_first_one_s_arrival() -> None:
     assert opening.passed([first, refused], 5) == [refused]
     assert opening.passed([second], MAX_HELD_NS) == []
     assert opening.passed([], 6 + MAX_HELD_NS) == [first, second]
+
+
+def test_a_message_that_may_have_waited_says_for_how_long_whatever_it_holds() -> None:
+    update = (b"SIM_UPDATE", viz_message(spacecraft=[craft()]))
+    messages = [
+        RawMessage(70, update, 50, timely=False),
+        RawMessage(80, (b"another word",), 55, timely=False),
+        RawMessage(90, update, 60),
+    ]
+    arrivals = BroadcastDecoder(follower()).arrivals(messages)
+    waited_ns = {arrival.host_ns: arrival.waited_ns for arrival in arrivals}
+    assert waited_ns == {70: 20, 80: 25, 90: 0}
 
 
 def test_no_rate_across_a_silence_a_jump_or_a_restart() -> None:

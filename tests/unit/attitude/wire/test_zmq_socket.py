@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import re
+from contextlib import closing
 
 import pytest
 import zmq
 
 from hilstar.attitude.wire import zmq_socket
 from hilstar.attitude.wire.keys import CurveKeys, load_public, load_secret, make_keys
-from hilstar.attitude.wire.zmq_links import ZmqRoad
+from hilstar.attitude.wire.roads import LinkCounts
+from hilstar.attitude.wire.zmq_links import ZmqRoad, ZmqRoadApart
 from hilstar.attitude.wire.zmq_socket import MAX_GROWTH_BYTES, MAX_PARTS, ZmqReply, ZmqSocket
 from hilstar.basics.notices import Notice, Notices
 from tests.support.refusals import refusal
@@ -97,6 +99,15 @@ def test_what_this_process_took_before_the_link_was_used_is_not_the_link_s(tmp_p
         used_bytes += 2 * MAX_GROWTH_BYTES
         link.wait_for_message(0)
         assert link.link_counts.resets == 1
+
+
+@pytest.mark.parametrize(("bind", "openings"), [(False, 2), (True, 0)])
+def test_connections_of_a_reading_process_are_openings_where_the_link_makes_them(bind, openings):
+    """After each opening a link's messages are read anew; who connects to it ends none of them."""
+    road = ZmqRoad("tcp://127.0.0.1:*" if bind else "tcp://127.0.0.1:5560", bind=bind)
+    with road, closing(ZmqRoadApart(road)) as apart:
+        apart._count(LinkCounts(connections=2))
+        assert apart.openings == openings
 
 
 def test_a_place_that_cannot_be_bound_is_refused_with_what_to_do(tmp_path):

@@ -372,6 +372,16 @@ def test_one_field_point_of_two_colours_has_simpler_glasses_and_one_psf_has_none
     assert [name for name, _ in glass_psf(alone, 0.0, np.ones(1)).simpler()] == [ONE_PSF]
 
 
+@pytest.mark.parametrize(("per_px", "integrated"), [(1, False), (1, True), (2, False), (3, False)])
+def test_samples_that_end_abruptly_are_drawn_with_all_their_light(per_px, integrated):
+    place = np.array([[100.0, 80.0, np.nan, 0.0]])
+    even = Stack(np.ones((1, 7, 7)), place, facts_of(1), per_px, integrated)
+    fraction_px = np.linspace(-0.5, 0.5, 9)
+    psf = glass_psf(glass_of(even), 0.0, np.ones(1))
+    stamps = psf.stamps_at(100.0 + fraction_px, 80.0 - fraction_px, np.ones(1), np.ones(9))
+    assert stamps.sum(axis=(1, 2)) == pytest.approx(1.0, abs=MAX_CUT)
+
+
 @pytest.mark.parametrize(("integrated", "side_px"), [(False, 5), (True, 7)])
 def test_a_footprint_holds_all_samples_and_the_pixels_that_are_integrated_in_them(
     integrated, side_px

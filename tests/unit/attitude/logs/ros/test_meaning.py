@@ -186,9 +186,11 @@ def test_an_optical_frame_with_a_mounting_is_said(bag):
 
 
 def test_of_several_topics_one_is_chosen_by_name(bag):
-    path = bag(
-        [*poses("icrs", rotations(2), "/a/pose"), *poses("icrs", rotations(3, seed=9), "/b/pose")]
-    )
+    names = ("/0/a/pose", "/a/pose", "/b/pose", "/z/a/pose")
+    sent = []
+    for count, name in enumerate(names, start=1):
+        sent += poses("icrs", rotations(count), name)
+    path = bag(sent)
     assert len(open_log(path, Stated(topic="/b/pose")).samples) == 3
     assert len(open_log(path, Stated(topic="a/pose")).samples) == 2
 

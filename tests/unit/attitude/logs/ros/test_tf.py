@@ -52,6 +52,12 @@ def test_where_one_transform_moves_the_body_need_not_be_named(bag):
     assert (attitudes_of(log) * moving).magnitude() == pytest.approx(0, abs=ROUNDING)
 
 
+def test_a_mount_alone_is_read_where_no_transform_of_the_bag_moves(bag):
+    turn = rotations(1)
+    log = open_log(bag([fixed_transform("icrs", "cam", wxyz(turn[0]))]))
+    assert (attitudes_of(log) * turn).magnitude() == pytest.approx(0, abs=ROUNDING)
+
+
 def test_a_frame_and_a_body_choose_one_of_several_transforms(bag):
     two = bag(tree([("map", "odom", rotations(3)), ("odom", "base", rotations(3, seed=7))]))
     assert len(open_log(two, Stated(reference="odom=icrs", body="base")).samples) == 3

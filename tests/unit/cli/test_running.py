@@ -31,6 +31,7 @@ from hilstar.cli.running import (
     page_listener,
     run_with_faults,
     say_beat,
+    say_seen,
     scpi_listener,
 )
 from hilstar.cli.shown_run import run_files
@@ -46,6 +47,7 @@ from hilstar.server.replay import DrawnBy
 from hilstar.server.summary import RunTally, RunVerdict
 from hilstar.server.watchdog import GPU_LOST
 from tests.support.benches import SMALL_BENCH, bench_text
+from tests.support.closed_camera import ClosedCamera, power_of
 from tests.support.model_display import model_screen
 from tests.support.senders import free_port
 
@@ -173,6 +175,24 @@ def test_a_dark_frame_that_is_named_counts_in_place_of_the_one_that_was_taken(
     file = bench_file_of(tmp_path / "bench.toml", SMALL_BENCH)
     images = dot_images(file, [], tmp_path, DotOptions(grab="shoot {output}", dark=named))
     assert images == DotImages([Path("0.fits")], dark)
+
+
+def test_dots_are_taken_with_the_exposure_that_is_asked_for_and_handed_on(tmp_path, monkeypatch):
+    camera = ClosedCamera(power_of(2.2), 400_000.0)
+    asked_s, handed = [], []
+    monkeypatch.setattr(camera, "hand_on", handed.append)
+    monkeypatch.setattr(image_source, "real_source", lambda *_: camera)
+
+    def grab_dots(file, source, plan, exposure_s, **_):
+        asked_s.append(exposure_s)
+        return DotImages([Path("0.fits")], Path("taken.fits"))
+
+    monkeypatch.setattr(grabbed_dots, "grab_dots", grab_dots)
+    file = bench_file_of(tmp_path / "bench.toml", SMALL_BENCH)
+    feed = f"tcp://127.0.0.1:{free_port()}"
+    dot_images(file, [], tmp_path, DotOptions(grab="shoot {output}", exposure=0.02, feed=feed))
+    assert asked_s == [0.02]
+    assert len(handed) == 1
 
 
 @pytest.mark.parametrize(
@@ -376,3 +396,22 @@ def test_the_files_of_a_run_are_read_or_written_and_never_both(tmp_path):
     ledger.write_bytes(b"a run")
     with pytest.raises(InputError, match=r"run\.mcap"):
         run_files(options, file)
+
+
+@pytest.mark.parametrize(
+    ("changes", "warning"),
+    [
+        ({}, "a star is 7.9 times as wide as the sky's"),
+        ({"collimator": {"focal_length_mm": 6.0}}, "check the units: "),
+    ],
+)
+def test_a_run_says_what_the_tracker_sees_and_where_that_is_implausible(
+    tmp_path, capsys, changes, warning
+):
+    (tmp_path / "bench.toml").write_text(bench_text(changes))
+    with load(tmp_path / "bench.toml") as bench:
+        seen = say_seen(bench)
+    fields, star, warned = capsys.readouterr().err.splitlines()
+    assert fields.startswith("screen ") and star.startswith("star ")
+    assert warned.startswith(warning)
+    assert seen["fields_of_view"]["screen_deg"] and seen["star"]["sigma_px"]

@@ -48,6 +48,7 @@ from hilstar.server.summary import RunTally, RunVerdict
 from hilstar.server.watchdog import GPU_LOST
 from tests.support.benches import SMALL_BENCH, bench_text
 from tests.support.closed_camera import ClosedCamera, power_of
+from tests.support.commands import run_hilstar_here
 from tests.support.model_display import model_screen
 from tests.support.senders import free_port
 
@@ -179,19 +180,21 @@ def test_a_dark_frame_that_is_named_counts_in_place_of_the_one_that_was_taken(
 
 def test_dots_are_taken_with_the_exposure_that_is_asked_for_and_handed_on(tmp_path, monkeypatch):
     camera = ClosedCamera(power_of(2.2), 400_000.0)
-    asked_s, handed = [], []
+    asked, opened, handed = [], [], []
     monkeypatch.setattr(camera, "hand_on", handed.append)
-    monkeypatch.setattr(image_source, "real_source", lambda *_: camera)
+    monkeypatch.setattr(image_source, "real_source", lambda *all_: opened.append(all_) or camera)
 
-    def grab_dots(file, source, plan, exposure_s, **_):
-        asked_s.append(exposure_s)
+    def grab_dots(file, source, plan, exposure_s, *, overwrite, tell):
+        asked.append((exposure_s, overwrite))
         return DotImages([Path("0.fits")], Path("taken.fits"))
 
     monkeypatch.setattr(grabbed_dots, "grab_dots", grab_dots)
     file = bench_file_of(tmp_path / "bench.toml", SMALL_BENCH)
     feed = f"tcp://127.0.0.1:{free_port()}"
-    dot_images(file, [], tmp_path, DotOptions(grab="shoot {output}", exposure=0.02, feed=feed))
-    assert asked_s == [0.02]
+    options = DotOptions(grab="shoot {output}", exposure=0.02, feed=feed, overwrite=True)
+    dot_images(file, [], tmp_path, options)
+    assert asked == [(0.02, True)]
+    assert opened == [(file, "shoot {output}")]
     assert len(handed) == 1
 
 
@@ -339,6 +342,32 @@ def test_a_session_s_lines_go_to_the_terminal_and_to_its_page(monkeypatch, capsy
             tell("step 2")
             show("a pattern")
         assert told == heard and capsys.readouterr().err == "step 2\n"
+
+
+@pytest.mark.parametrize("forced", [False, True])
+def test_a_session_takes_any_monitor_and_orders_from_its_page_only_where_it_is_told_to(
+    tmp_path, monkeypatch, forced
+):
+    camera = ClosedCamera(power_of(2.2), 400_000.0)
+    asked = []
+
+    def find_monitor(file, today, *, force):
+        asked.append(force)
+        raise MachineError("there is no monitor")
+
+    def session_page(listener, control, file):
+        asked.append(control)
+        return nullcontext(SimpleNamespace(say=print, show=print))
+
+    monkeypatch.setattr(camera, "find_monitor", find_monitor)
+    monkeypatch.setattr(first_light, "image_source", lambda *_: camera)
+    monkeypatch.setattr("hilstar.server.console.publisher.session_page", session_page)
+    (tmp_path / "bench.toml").write_text(bench_text())
+    words = ["first-light", "bench.toml", "-o", "s", "--grab", "take {output}"]
+    words += ["--console", "127.0.0.1:0", *["--force", "--control"] * forced]
+    done = run_hilstar_here(*words, cwd=tmp_path)
+    assert done.returncode == 3 and "there is no monitor" in done.stderr
+    assert asked == [forced, forced]
 
 
 def test_answers_are_taken_and_frames_are_fed_while_a_run_lasts(tmp_path, monkeypatch, capsys):

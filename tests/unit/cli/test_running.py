@@ -4,7 +4,7 @@ no run.
 
 from __future__ import annotations
 
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,6 +20,7 @@ from hilstar.cli import first_light, image_source
 from hilstar.cli.image_source import DotOptions, dot_images
 from hilstar.cli.running import (
     ActingPageOptions,
+    DisplayOptions,
     PageOptions,
     RunOptions,
     dated_ledger,
@@ -33,6 +34,7 @@ from hilstar.cli.running import (
     say_beat,
     say_seen,
     scpi_listener,
+    shown_bench,
 )
 from hilstar.cli.shown_run import run_files
 from hilstar.cli.tracker import open_camera
@@ -342,6 +344,26 @@ def test_a_session_s_lines_go_to_the_terminal_and_to_its_page(monkeypatch, capsy
             tell("step 2")
             show("a pattern")
         assert told == heard and capsys.readouterr().err == "step 2\n"
+
+
+@pytest.mark.parametrize("is_asked", [False, True])
+def test_a_screen_is_a_window_and_forced_only_where_it_is_asked_to_be(
+    tmp_path, monkeypatch, is_asked
+):
+    screen, _ = model_screen(tmp_path)
+    asked = []
+
+    @contextmanager
+    def open_screen(file, today, *, windowed, force, timed):
+        asked.append((windowed, force, timed))
+        yield screen
+
+    monkeypatch.setattr("hilstar.server.screen.gate.open_screen", open_screen)
+    file = bench_file_of(tmp_path / "bench.toml", SMALL_BENCH)
+    display = DisplayOptions(windowed=is_asked, force=is_asked)
+    with shown_bench(file, display, timed=True) as shown:
+        assert shown == (screen.bench, screen)
+    assert asked == [(is_asked, is_asked, True)]
 
 
 @pytest.mark.parametrize("forced", [False, True])

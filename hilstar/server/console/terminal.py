@@ -45,6 +45,7 @@ STATE_STYLES = {
 }
 NAME_STYLE = "bold cyan"  # as options in --help
 BUSY_AFTER_S = 1.0  # a command that ends sooner shows no spinner
+BUSY_THREAD = "hilstar-busy"
 ERASED_WITHIN_S = 0.5
 CLOCK_WORDS = {"one-way": "from arrivals", "exchange": "from time exchanges"}
 
@@ -269,7 +270,9 @@ def busy(what: str, after_s: float = BUSY_AFTER_S) -> Iterator[None]:
         yield
         return
     ended = threading.Event()
-    shower = threading.Thread(target=_show_busy, args=(what, after_s, ended), daemon=True)
+    shower = threading.Thread(
+        target=_show_busy, args=(what, after_s, ended), name=BUSY_THREAD, daemon=True
+    )
     shower.start()
     try:
         yield

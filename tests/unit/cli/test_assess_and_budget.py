@@ -69,3 +69,21 @@ def test_a_budget_is_of_a_bench_and_a_centroider_and_may_be_drawn(tmp_path):
     assert list((tmp_path / "out").iterdir())
     refused = run_hilstar_here("budget", "bench.toml", "--centroider", "box4", cwd=tmp_path)
     assert refused.returncode == 2 and "--centroider box4: did you mean box" in refused.stderr
+
+
+NOISY = {
+    "tracker": {"resolution_px": [48, 48], "focal_length_mm": 12.0},
+    "tracker.detector": {"read_noise_e": 12},
+    "sky": {"faintest_v_mag": 3.0},
+}
+
+
+def test_the_noise_of_a_place_is_of_its_own_stars(tmp_path):
+    """Orion's belt, and not the median of fields all over the sky."""
+    (tmp_path / "bench.toml").write_text(bench_text(NOISY))
+    words = ("budget", "bench.toml", "--noise", "--radec", "84.057,-1.2,0", "--json")
+    done = run_hilstar_here(*words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["fields"] == 1
+    assert {26311, 25930, 26727} <= {star["hip"] for star in found["stars"]}

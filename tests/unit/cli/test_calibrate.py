@@ -24,7 +24,9 @@ from hilstar.cli.pointing import PointingOptions
 from hilstar.display.identity import MonitorIdentity
 from hilstar.instruments.calibrate import alignment as alignment_engine
 from hilstar.instruments.calibrate import photometric as photometric_engine
+from hilstar.instruments.calibrate import plan as plan_engine
 from hilstar.instruments.calibrate import scale as scale_engine
+from hilstar.instruments.calibrate.geometric import dots as dots_engine
 from hilstar.instruments.calibrate.scale import MeasuredScale
 from hilstar.server.answers.star_widths import FocusFigure, FocusReading
 from hilstar.server.bench import build, frame_files
@@ -208,6 +210,26 @@ def test_dots_are_as_white_as_the_monitor_and_counted_in_each_frame(tmp_path, mo
     assert (tmp_path / "more" / "plan.csv").read_text() != plan
 
 
+def test_dots_and_patches_are_shown_as_long_and_where_they_are_asked_for(tmp_path, monkeypatch):
+    shown = []
+
+    def show_dots(plan, monitor, dwell_s, windowed):
+        shown.append((plan.frames, dwell_s, windowed))
+        return 7
+
+    def show_patches(planned, bits, display, dwell_s):
+        shown.append((bits, display, dwell_s))
+        return 5
+
+    monkeypatch.setattr(dots_engine, "show_dots", show_dots)
+    monkeypatch.setattr(plan_engine, "show_patches", show_patches)
+    words = "dots bench.toml -o dots --frames 8 --dots 9 --show --dwell 0.5 --windowed"
+    assert "7 of 8 frames shown" in run_calibrate(tmp_path, *words.split()).stderr
+    words = "plan -o plan.csv --levels 3 --repeats 1 --bits 10 --show --display HDMI-1 --dwell 2"
+    assert "5 of " in run_calibrate(tmp_path, *words.split()).stderr
+    assert shown == [(8, 0.5, True), (10, "HDMI-1", 2.0)]
+
+
 @pytest.mark.parametrize(
     ("line", "refused"),
     [
@@ -235,18 +257,21 @@ def test_a_response_has_the_name_date_instrument_and_unit_of_its_readings(tmp_pa
         given.append((measured, output, provenance, bits, identity))
         return response_summary() | {"written": ["m.toml"]}
 
+    drawn = []
     monkeypatch.setattr(photometric_engine, "calibrate_photometric", calibrate_photometric)
+    monkeypatch.setattr(photometric_engine, "draw_calibration", lambda *all_: drawn.append(all_))
     monkeypatch.setattr("hilstar.display.window.this_monitor.identity_here", lambda display: None)
     (tmp_path / "read.csv").write_text("")
-    words = "--who me --when 2026-01-02 --instrument LS-160 --unit cd/m2 --bits 10"
+    words = "--who me --when 2026-01-02 --instrument LS-160 --unit cd/m2 --bits 10 --plot p.png"
     done = run_calibrate(tmp_path, "photometric", "read.csv", "-o", "m.toml", *words.split())
     assert done.returncode == 0, done.stderr
     made = photometric_engine.Provenance(
         who="me", when="2026-01-02", instrument="LS-160", unit="cd/m2"
     )
     assert given == [(Path("read.csv"), Path("m.toml"), made, 10, None)]
+    assert drawn == [(Path("read.csv"), Path("p.png"), 10)]
     assert done.stdout.splitlines()[4:] == [
-        "written             m.toml",
+        "written             m.toml, p.png",
         'in the bench file   [monitor] calibration = "m.toml"',
     ]
 

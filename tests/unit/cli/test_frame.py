@@ -68,6 +68,17 @@ def test_codes_are_written_with_the_monitor_s_bits_and_faults_as_they_are_then(
     assert written[1][0] == 1023
 
 
+def test_each_file_of_a_frame_is_written_where_it_is_named(small_bench_file, tmp_path):
+    files = {"-o": "f.fits", "--truth": "t.csv", "--codes": "c.png", "--preview": "p.png"}
+    words = [word for pair in files.items() for word in pair]
+    done = run_hilstar_here(
+        "frame", small_bench_file, "--radec", "84,-1,0", *words, "--json", cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["written"] == list(files.values())
+    assert all((tmp_path / name).stat().st_size for name in files.values())
+
+
 def test_what_the_monitor_cannot_show_is_counted_with_its_share_of_all_stars_light():
     rows = [("", 6.0, True), ("", 1.0, False), ("Moon", 1e6, True), ("", 3.0, False)]
     kinds = [("name", "U8"), ("electrons_per_s", "f8"), ("drawn", bool)]

@@ -105,3 +105,6 @@ def test_a_lens_is_traced_onto_the_pixels_that_are_given_or_else_the_bench_s(
     assert done.stdout.splitlines()[-1] == (
         "in the bench file, under [tracker]: focal_length_mm = 70.5  # F/2.35"
     )
+    words = ("optics", "lens", "lens.zmx", "-o", "g.fits", *words, "--json")
+    told = json.loads(run_hilstar_here(*words, cwd=tmp_path).stdout)
+    assert (told["focal_length_mm"], told["f_number"], told["notes"]) == (70.5, 2.35, ["a note"])

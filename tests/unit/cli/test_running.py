@@ -4,7 +4,7 @@ no run.
 
 from __future__ import annotations
 
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,6 +20,7 @@ from hilstar.cli import first_light, image_source
 from hilstar.cli.image_source import DotOptions, dot_images
 from hilstar.cli.running import (
     ActingPageOptions,
+    DisplayOptions,
     PageOptions,
     RunOptions,
     dated_ledger,
@@ -31,7 +32,9 @@ from hilstar.cli.running import (
     page_listener,
     run_with_faults,
     say_beat,
+    say_seen,
     scpi_listener,
+    shown_bench,
 )
 from hilstar.cli.shown_run import run_files
 from hilstar.cli.tracker import open_camera
@@ -46,6 +49,8 @@ from hilstar.server.replay import DrawnBy
 from hilstar.server.summary import RunTally, RunVerdict
 from hilstar.server.watchdog import GPU_LOST
 from tests.support.benches import SMALL_BENCH, bench_text
+from tests.support.closed_camera import ClosedCamera, power_of
+from tests.support.commands import run_hilstar_here
 from tests.support.model_display import model_screen
 from tests.support.senders import free_port
 
@@ -173,6 +178,26 @@ def test_a_dark_frame_that_is_named_counts_in_place_of_the_one_that_was_taken(
     file = bench_file_of(tmp_path / "bench.toml", SMALL_BENCH)
     images = dot_images(file, [], tmp_path, DotOptions(grab="shoot {output}", dark=named))
     assert images == DotImages([Path("0.fits")], dark)
+
+
+def test_dots_are_taken_with_the_exposure_that_is_asked_for_and_handed_on(tmp_path, monkeypatch):
+    camera = ClosedCamera(power_of(2.2), 400_000.0)
+    asked, opened, handed = [], [], []
+    monkeypatch.setattr(camera, "hand_on", handed.append)
+    monkeypatch.setattr(image_source, "real_source", lambda *all_: opened.append(all_) or camera)
+
+    def grab_dots(file, source, plan, exposure_s, *, overwrite, tell):
+        asked.append((exposure_s, overwrite))
+        return DotImages([Path("0.fits")], Path("taken.fits"))
+
+    monkeypatch.setattr(grabbed_dots, "grab_dots", grab_dots)
+    file = bench_file_of(tmp_path / "bench.toml", SMALL_BENCH)
+    feed = f"tcp://127.0.0.1:{free_port()}"
+    options = DotOptions(grab="shoot {output}", exposure=0.02, feed=feed, overwrite=True)
+    dot_images(file, [], tmp_path, options)
+    assert asked == [(0.02, True)]
+    assert opened == [(file, "shoot {output}")]
+    assert len(handed) == 1
 
 
 @pytest.mark.parametrize(
@@ -321,6 +346,52 @@ def test_a_session_s_lines_go_to_the_terminal_and_to_its_page(monkeypatch, capsy
         assert told == heard and capsys.readouterr().err == "step 2\n"
 
 
+@pytest.mark.parametrize("is_asked", [False, True])
+def test_a_screen_is_a_window_and_forced_only_where_it_is_asked_to_be(
+    tmp_path, monkeypatch, is_asked
+):
+    screen, _ = model_screen(tmp_path)
+    asked = []
+
+    @contextmanager
+    def open_screen(file, today, *, windowed, force, timed):
+        asked.append((windowed, force, timed))
+        yield screen
+
+    monkeypatch.setattr("hilstar.server.screen.gate.open_screen", open_screen)
+    file = bench_file_of(tmp_path / "bench.toml", SMALL_BENCH)
+    display = DisplayOptions(windowed=is_asked, force=is_asked)
+    with shown_bench(file, display, timed=True) as shown:
+        assert shown == (screen.bench, screen)
+    assert asked == [(is_asked, is_asked, True)]
+
+
+@pytest.mark.parametrize("forced", [False, True])
+def test_a_session_takes_any_monitor_and_orders_from_its_page_only_where_it_is_told_to(
+    tmp_path, monkeypatch, forced
+):
+    camera = ClosedCamera(power_of(2.2), 400_000.0)
+    asked = []
+
+    def find_monitor(file, today, *, force):
+        asked.append(force)
+        raise MachineError("there is no monitor")
+
+    def session_page(listener, control, file):
+        asked.append(control)
+        return nullcontext(SimpleNamespace(say=print, show=print))
+
+    monkeypatch.setattr(camera, "find_monitor", find_monitor)
+    monkeypatch.setattr(first_light, "image_source", lambda *_: camera)
+    monkeypatch.setattr("hilstar.server.console.publisher.session_page", session_page)
+    (tmp_path / "bench.toml").write_text(bench_text())
+    words = ["first-light", "bench.toml", "-o", "s", "--grab", "take {output}"]
+    words += ["--console", "127.0.0.1:0", *["--force", "--control"] * forced]
+    done = run_hilstar_here(*words, cwd=tmp_path)
+    assert done.returncode == 3 and "there is no monitor" in done.stderr
+    assert asked == [forced, forced]
+
+
 def test_answers_are_taken_and_frames_are_fed_while_a_run_lasts(tmp_path, monkeypatch, capsys):
     taken: list[str] = []
     source = SimpleNamespace(
@@ -376,3 +447,22 @@ def test_the_files_of_a_run_are_read_or_written_and_never_both(tmp_path):
     ledger.write_bytes(b"a run")
     with pytest.raises(InputError, match=r"run\.mcap"):
         run_files(options, file)
+
+
+@pytest.mark.parametrize(
+    ("changes", "warning"),
+    [
+        ({}, "a star is 7.9 times as wide as the sky's"),
+        ({"collimator": {"focal_length_mm": 6.0}}, "check the units: "),
+    ],
+)
+def test_a_run_says_what_the_tracker_sees_and_where_that_is_implausible(
+    tmp_path, capsys, changes, warning
+):
+    (tmp_path / "bench.toml").write_text(bench_text(changes))
+    with load(tmp_path / "bench.toml") as bench:
+        seen = say_seen(bench)
+    fields, star, warned = capsys.readouterr().err.splitlines()
+    assert fields.startswith("screen ") and star.startswith("star ")
+    assert warned.startswith(warning)
+    assert seen["fields_of_view"]["screen_deg"] and seen["star"]["sigma_px"]

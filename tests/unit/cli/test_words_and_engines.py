@@ -67,6 +67,7 @@ from hilstar.instruments.assess import assessment
 from hilstar.instruments.assess.budget import Axes
 from hilstar.instruments.calibrate import camera_edges, effective_psf
 from hilstar.instruments.calibrate import latency as by_diode
+from hilstar.instruments.calibrate.geometric import geometry_fit
 from hilstar.instruments.calibrate.latency import Edges
 from hilstar.instruments.campaign import acceptance as acceptance_engine
 from hilstar.instruments.campaign import acceptance_page, acceptance_plan, pool
@@ -536,6 +537,30 @@ def test_a_camera_films_the_square_as_the_run_s_bench_file_says(
     assert (opened[0], opened[-1]) == ("SN7", "closed")
     refused = run_hilstar_here("latency", str(ledger), "--grab", "take {output}", cwd=tmp_path)
     assert refused.returncode == 2 and "a command takes one image at a time" in refused.stderr
+
+
+def test_the_geometry_of_dots_is_found_with_what_the_words_name(
+    tmp_path: Path, engine: Callable[[Any, str, Any], Engine], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "bench.toml").write_text(bench_text())
+    (tmp_path / "plan").mkdir()
+    for name in ("plan/plan.csv", "seen.csv", "dark.fits"):
+        (tmp_path / name).write_bytes(b"")
+    asked = engine(geometry_fit, "calibrate_files", "the fit")
+    written = engine(geometry_fit, "write_calibrated", ["g.toml", "p.png"])
+    monkeypatch.setattr(geometry_fit, "summary_of", lambda found, names: {"written": names})
+    monkeypatch.setattr(geometry_fit, "lines_of", lambda found: ["fitted"])
+    words = "calibrate geometric bench.toml seen.csv --plan plan -o g.toml --dark dark.fits"
+    done = run_hilstar_here(
+        *words.split(), "--plot", "p.png", "--tracker-is-ideal", "--json", cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    (file, seen, plan, dark), named = asked.given[0]
+    assert file.path.name == "bench.toml"
+    assert (seen, plan, dark) == ([Path("seen.csv")], Path("plan/plan.csv"), Path("dark.fits"))
+    assert named == {"tracker_is_ideal": True}
+    assert written.given[0][0][:3] == (Path("g.toml"), "the fit", Path("p.png"))
+    assert json.loads(done.stdout) == {"written": ["g.toml", "p.png"]}
 
 
 def test_the_psf_of_dots_is_found_with_what_the_words_name(

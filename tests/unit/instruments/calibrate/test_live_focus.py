@@ -148,12 +148,16 @@ def test_a_pattern_is_shown_to_its_watcher_once_and_images_are_read_as_they_come
 def test_the_command_ends_with_the_best_image(benches, tmp_path):
     _, truth = benches
     bench = tmp_path / "truth-1.0.toml"
-    words = ("--images", "3", "--exposure", str(EXPOSURE_S), "--json")
+    feed = f"tcp://127.0.0.1:{free_port()}"
+    words = ("--images", "3", "--exposure", str(EXPOSURE_S), "--feed", feed, "--json")
     done = run_hilstar_here("calibrate", "focus", bench, "--virtual", truth(1.4).path, *words)
     assert done.returncode == 0, done.stderr
+    assert f"frames: {feed}" in done.stderr
     *figures, last = [json.loads(line) for line in done.stdout.splitlines()]
     best = last["best"]["figure"]
     assert [figure["number"] for figure in figures] == [1, 2, 3]
+    # with the bench file's exposure the first dots saturate the tracker
+    assert all(figure["figure"] is not None for figure in figures)
     assert abs(best["psf_sigma_px"] - 1.4) < SURE_SIGMAS * best["error_px"]
 
 

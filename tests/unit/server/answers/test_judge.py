@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from hilstar.basics.process.scheduling import UnixOffset
 from hilstar.basics.rotation import from_rotation_vector, multiply, propagate
-from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
+from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_MS, NS_PER_S
 from hilstar.server.answers import judge as judge_module
 from hilstar.server.answers.answer import Answer
 from hilstar.server.answers.judge import (
@@ -288,6 +288,18 @@ def test_the_last_minutes_residual_is_the_planted_error(clock):
     assert judge.figures(found[-1][0].answer.host_ns + 3 * NS_PER_S, {}).silent.endswith(
         "has not answered for 3.0 s"
     )
+
+
+def test_the_newest_answer_stands_with_its_own_figures_in_their_units():
+    rules = AnswerRules(EXPOSURE_S, clock="unix")
+    judge = AnswerJudge(rules, lit_until(1.0))
+    judge.times = AnswerTimes(rules, lambda: UnixOffset(0, 3 * NS_PER_MS))
+    middle_ns, host_ns = 500 * NS_PER_MS, 620 * NS_PER_MS
+    q = attitude_at(0.5)
+    judge.judge(Answer(host_ns, b"", middle_ns, q, star_count=9, mode="track"))
+    figures = judge.figures(host_ns + 250 * NS_PER_MS, {})
+    assert (figures.latency_ms, figures.latency_sigma_ms, figures.age_s) == (120.0, 3.0, 0.25)
+    assert (figures.verdict, figures.stars, figures.mode) == ("right", 9, "track")
 
 
 def test_a_stated_latency_is_taken_and_not_fitted():

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import io
 import sys
+import threading
 import time
 
 import pytest
 
-from hilstar.server.console.terminal import busy, print_states, progress
+from hilstar.server.console.terminal import BUSY_THREAD, busy, print_states, progress
 
 
 class Terminal(io.StringIO):
@@ -46,6 +47,14 @@ def test_what_takes_long_is_named_on_a_terminal(on_terminal):
     terminal = on_terminal()
     with busy("computing the catalogue", after_s=SOON_S):
         wait_for(terminal, "computing the catalogue")
+
+
+def test_nothing_of_a_wait_runs_on_when_it_is_over(on_terminal):
+    """Else its line would be erased after the result stands on stdout."""
+    terminal = on_terminal()
+    with busy("computing the catalogue", after_s=SOON_S):
+        wait_for(terminal, "computing the catalogue")
+    assert BUSY_THREAD not in [thread.name for thread in threading.enumerate()]
 
 
 def test_what_ends_soon_is_not(on_terminal):

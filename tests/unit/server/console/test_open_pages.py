@@ -97,6 +97,11 @@ def test_one_that_does_not_read_gives_way_before_one_that_asked_for_nothing():
     assert closed_for_another(pages) == [20]
 
 
+def test_a_page_that_answers_each_ping_counts_as_one_that_reads_until_the_next():
+    """Else it would give way to a new one, in nearly every moment between two pings."""
+    assert connections.UNREAD_S >= 2 * connections.PING_S
+
+
 def test_of_equals_the_oldest_of_the_address_with_the_most_pages_gives_way():
     pages = [page("10.0.0.1"), page("10.0.0.2")]
     pages += [page("10.0.0.3") for _ in range(MAX_CLIENTS - 2)]

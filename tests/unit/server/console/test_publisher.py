@@ -259,6 +259,9 @@ def test_a_mark_is_told_in_one_line_with_who_wrote_it(orders):
     assert orders.do("mark", text=" \n")[0] == 400
     orders.do("mark", who="w" * 61, text="lamp off")
     assert told[-1] == ("mark", f"mark, by {'w' * 60}: lamp off", "w" * 60)
+    # a line of text, and no more of what a stranger sends
+    orders.do("mark", who="ann", text="t" * 201)
+    assert told[-1] == ("mark", f"mark, by ann: {'t' * 200}", "ann")
 
 
 def test_a_ledger_is_begun_once_and_ended_with_what_became_of_it(orders, tmp_path, monkeypatch):

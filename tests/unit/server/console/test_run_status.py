@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
+import logging
 import math
+import sys
 from typing import Any
 
 import numpy as np
@@ -14,12 +17,13 @@ from hilstar.basics.notices import Notices
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.basics.units import NS_PER_S
 from hilstar.basics.wrong_sky import RATES
-from hilstar.server.console.run_status import RunSource, RunStatus, StatusLine
+from hilstar.server.console.run_status import RunSource, RunStatus, StatusLine, on_terminal
 from hilstar.server.loop import FrameLoop
 from hilstar.server.pacer import Shown
 from hilstar.server.record.ledger import Ledger, LedgerSwitch
 from hilstar.server.run_progress import Running
 from tests.support.drawn import drawn
+from tests.support.waiting import wait_for
 
 BEGUN_NS = 50 * NS_PER_S
 DRAWN = drawn(np.zeros((3, 4), np.uint8))
@@ -165,3 +169,23 @@ def test_a_run_is_alive_while_its_loop_takes_steps(loop, hz, limit_s):
     assert run.status.alive()
     run.now_ns += round(0.02 * NS_PER_S)
     assert not run.status.alive()
+
+
+class Terminal(io.StringIO):
+    """A stream that says it is a terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_log_lines_stand_above_the_live_lines_and_afterwards_where_they_stood(run, monkeypatch):
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    handler = logging.StreamHandler(terminal)
+    logging.getLogger().addHandler(handler)
+    try:
+        with on_terminal(run.status):
+            wait_for(lambda: handler.stream is not terminal, "the live lines")
+        assert handler.stream is terminal
+    finally:
+        logging.getLogger().removeHandler(handler)

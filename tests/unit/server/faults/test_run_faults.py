@@ -126,7 +126,9 @@ def test_a_run_tells_counts_and_records_each_of_its_faults(bench, scenario, tmp_
     by_name = {each.name: each.file_sha256 for each in events}
     assert by_name == {"cover": "", "spark": "", "stray": sha256, "stuck": ""}
     assert msgspec.json.decode(events[0].table)["kind"] == "blank"
+    run.frames.dropped, run.frames.frozen = 1, 2
     summary = run.summary()
+    assert (summary["dropped_frames"], summary["frozen_frames"]) == (1, 2)
     assert summary["started"] == {"cover": 1, "spark": 1, "stray": 1, "stuck": 1}
     assert (summary["missed"], summary["on"]) == ({}, ["stray", "stuck"])
     assert summary["scenario"] == str(tmp_path / "faults.toml")
@@ -208,6 +210,8 @@ def test_a_replay_has_the_light_of_a_run_s_faults_again_and_what_froze_it(
     frame.faults, frame.fault_since_ns = (), ()
     replay.recall(frame)
     assert replay.frames._source(0) == ()
+    replay.frames.dropped, replay.frames.frozen = 1, 2
+    assert replay.summary()["frozen_frames"] == 2
 
 
 def test_another_map_than_the_run_s_is_refused(scenario, tmp_path):

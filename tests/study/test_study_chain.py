@@ -146,14 +146,16 @@ def small_chain(small_run, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(measuring, "MIN_ROUNDS", 1)
         patch.setattr(measuring, "FRAMES_A_VISIT", 1)
-        patch.setattr(run, "QUICK", Rounds(exposures=1, time_s=0.0))
+        patch.setattr(run, "Rounds", partial(Rounds, exposures=1, time_s=0.0))
+        patch.setattr(run, "QUICK", None)  # which a whole study does not ask for
         patch.setattr(run, "five_scenes", two)
-        patch.setattr(run, "glass_rows", lambda file, scene, quick: in_glass.append(scene) or [])
+        patch.setattr(run, "glass_rows", lambda *asked: in_glass.append(asked) or [])
         done = []
-        found = small_run(lambda folder: run.run(file, folder, True, done.append))
+        found = small_run(lambda folder: run.run(file, folder, False, done.append))
     assert done == [1, 2]
     # the second scene is the densest field
-    assert [scene.name for scene in in_glass] == ["1 deg/s"]
+    ((_, scene, quick),) = in_glass
+    assert (scene.name, quick) == ("1 deg/s", False)
     return found
 
 

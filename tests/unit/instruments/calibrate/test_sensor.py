@@ -227,6 +227,8 @@ def test_a_bench_takes_the_tables_that_are_written(tmp_path):
     ]
     assert all(file.is_file() for file in files)
     _, tables = files[0].read_text().split("[tracker]\n")
+    # beside it, wherever both are moved
+    assert tables.startswith('quantum_efficiency = "camera_qe.csv"\n')
     bench = SMALL_BENCH.replace('quantum_efficiency = "ccd47-20"\n', "").replace(
         "[tracker]\n", "[tracker]\n" + tables.split("[")[0]
     )

@@ -101,6 +101,7 @@ def test_a_bench_s_ratios_are_by_its_own_weighting(tmp_path, small_run):
     assert abs(by_energy / at[3000] - 1) > 0.01
     (electrons,) = (y for label, _, y in run.lines("rapp_bench", 0) if label == "electrons")
     np.testing.assert_array_equal(electrons, table["rapp3_photon"])
+    assert run.note("rapp_bench").endswith("Solid: photon weighting; dotted: energy.")
 
 
 def truth_of(*stars: tuple[int, str, float, float, float, bool]) -> np.ndarray:

@@ -146,14 +146,16 @@ def small_chain(small_run, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(measuring, "MIN_ROUNDS", 1)
         patch.setattr(measuring, "FRAMES_A_VISIT", 1)
-        patch.setattr(run, "QUICK", Rounds(exposures=1, time_s=0.0))
+        patch.setattr(run, "Rounds", partial(Rounds, exposures=1, time_s=0.0))
+        patch.setattr(run, "QUICK", None)  # which a whole study does not ask for
         patch.setattr(run, "five_scenes", two)
-        patch.setattr(run, "glass_rows", lambda file, scene, quick: in_glass.append(scene) or [])
+        patch.setattr(run, "glass_rows", lambda *asked: in_glass.append(asked) or [])
         done = []
-        found = small_run(lambda folder: run.run(file, folder, True, done.append))
+        found = small_run(lambda folder: run.run(file, folder, False, done.append))
     assert done == [1, 2]
     # the second scene is the densest field
-    assert [scene.name for scene in in_glass] == ["1 deg/s"]
+    ((_, scene, quick),) = in_glass
+    assert (scene.name, quick) == ("1 deg/s", False)
     return found
 
 
@@ -642,7 +644,7 @@ def test_a_star_on_a_path_is_found_with_a_tenth_of_its_light(parts):
     assert judge.lost_arcsec == pytest.approx(path_arcsec, rel=1e-6)
 
 
-def test_no_star_is_judged_that_clips_or_shows_less_than_half_a_step(parts):
+def test_no_star_is_judged_that_clips_or_shows_less_than_half_a_step_or_is_in_a_crowd(parts):
     """Alnilam (V = 1.7) is over white, and alone."""
     benches, tracker = parts
     scene = ChainScene("Alnilam", "", from_radec_roll_deg(84.05, -1.2, 0.0))
@@ -654,6 +656,13 @@ def test_no_star_is_judged_that_clips_or_shows_less_than_half_a_step(parts):
     first_step = benches.own.calibration.response.light[1]
     assert len(judge) > 10 and peaks.max() < 1.05
     assert (rates / white).min() > 0.9 * first_step / 2
+    # nor one that has another of a tenth of its light within its window of 5 px to each side
+    x_px, y_px = tracker.camera.project(judge.true @ tracker.camera.cam_to_image.T)
+    apart_px = np.maximum(np.abs(x_px[:, None] - x_px), np.abs(y_px[:, None] - y_px))
+    is_near = (apart_px < tracker.finder.settings.radius_px) & ~np.eye(len(x_px), dtype=bool)
+    is_bright = judge._e > 0.1 * judge._e[:, None]
+    has_neighbour = (is_near & is_bright).any(axis=1)
+    assert has_neighbour.sum() >= 3 and not has_neighbour[judge.judged].any()
 
 
 def test_points_that_are_drawn_for_paths_are_charged_to_smear_alone(parts, monkeypatch):

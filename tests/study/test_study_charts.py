@@ -120,7 +120,12 @@ def test_every_line_of_the_budget_has_a_name_where_it_ends(figures, bench_with, 
             if not str(line.get_label()).startswith("_")
         ]
         assert sorted(text.get_text() for text in axis.texts) == sorted(named)
+    note = " ".join(figure.get_supxlabel().split())
     flux, place, each = figure.axes
+    clips, nothing = (line.get_xdata()[0] for line in flux.get_lines()[-2:])
+    assert clips < nothing
+    assert f"first grey line stars clip (V = {clips:.2f})" in note
+    assert f"they show nothing (V = {nothing:.2f})" in note
     for axis, limits in ((flux, FLUX_LIMITS_MAG), (place, (CENTROID_LIMIT_PX,))):
         drawn = {str(line.get_label()): np.asarray(line.get_ydata()) for line in axis.get_lines()}
         assert (np.diff(drawn["largest to V"]) >= 0).all() and (

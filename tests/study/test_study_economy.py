@@ -97,6 +97,8 @@ def test_a_small_scene_has_the_recorded_errors_and_its_chart(small_run):
                 mag = float(auto["flux_max_mag"])
                 wanted = max(mag / tolerance.mag, worst_px / tolerance.px)
             np.testing.assert_allclose([bar.get_height() for bar in bars], [wanted])
+    tolerances = "default, 0.05 mag and 0.1 px; 0.1, 0.1 mag and 0.1 px."
+    assert run.note("economy").endswith(f"Tolerances: {tolerances}")
     assert run.levels("economy", 0) == {"as fast as full effort": 1.0}
     assert run.levels("economy", 1) == {"tolerance": 1.0}
     lines = run.told[0]

@@ -225,6 +225,8 @@ def test_a_quick_study_s_table_chart_and_lines_are_those_of_its_limits(small):
         assert f"({stress}): " in run.told[1 + panel]
         assert run.told[1 + panel].startswith(axes.get_title(loc="left"))
     assert len(run.told) == 13 and run.told[0] == run.title("limits")
+    tolerance = "Red: the tolerance, 0.05 mag, 0.1 px, or 3.4 arcsec, which is 0.1 px of the demo's"
+    assert tolerance in run.note("limits")
 
 
 @pytest.mark.parametrize("measured", [limits.coarse_codes, limits.faint_stars])

@@ -42,6 +42,7 @@ from hilstar.instruments.study.sweep import Spent, beaten_by, spent
 from hilstar.instruments.study.timing import stripe_depth
 from hilstar.optics.frame_motion import CameraTurn
 from hilstar.optics.sprites import pack_sprites
+from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import ORION_Q, ROOT
 from tests.support.tables import csv_rows
 
@@ -278,6 +279,16 @@ def test_equation_2_3_gives_the_check_values_of_its_quaternions():
     ):
         matrix = sky_figures.equation_2_3(*radec_roll_deg)
         np.testing.assert_allclose(matrix.T, to_matrix(np.array(q)), atol=1e-6)
+
+
+def test_studies_have_the_tracker_of_the_demo_and_its_aperture():
+    tracker = read_bench_file(ROOT / "configs" / "demo.toml").config.tracker
+    for key, value in study_benches.TRACKER.items():
+        assert getattr(tracker, key) == value
+    area_m2 = math.pi / 4 * (1e-3 * tracker.aperture_mm) ** 2
+    assert study_benches.study_optics("ccd47-20").area_m2 == pytest.approx(area_m2)
+    width_px, height_px = study_benches.FULL_HD["resolution_px"]
+    assert (width_px, height_px, study_benches.FULL_HD["pixel_pitch_um"]) == (1920, 1080, 57.65)
 
 
 def test_orion_s_frames_show_one_sky_about_the_boresight_of_each(small_run):

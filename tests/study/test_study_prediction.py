@@ -146,6 +146,12 @@ def test_a_small_study_is_off_by_what_its_packets_leave(small_run, monkeypatch):
     findings, _ = run.told
     assert findings[0] == run.title("prediction") and len(findings) == 1 + 5 + 1
     assert findings[1].startswith(f"hold: {held_arcsec:.3g} arcsec rms, ")
+    shaken = "2 arcsec at 3.1 Hz, 1 arcsec at 11 Hz, 0.3 arcsec at 37 Hz"
+    assert run.note("prediction").startswith(f"A swing of 3 degrees in 20 s, shaken by {shaken}.")
+    assert run.note("prediction_jitter").startswith(
+        "Packets at 100 Hz, the newest 20 ms old at light on the mean; a vibration of 2 arcsec"
+        " beside a turn of 0.5 deg/s."
+    )
     # a vibration that is shown as it is has a gain of 1
     for panel in (2, 3):
         assert list(run.levels("prediction_jitter", panel).values()) == [1.0]

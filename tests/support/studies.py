@@ -218,6 +218,10 @@ class SmallRun:
         title = self.charts[stem].get_suptitle()
         return " ".join(title.replace("\N{NO-BREAK SPACE}", " ").split())
 
+    def note(self, stem: str) -> str:
+        """The note below a chart, in one line."""
+        return " ".join(self.charts[stem].get_supxlabel().split())
+
     def lines(self, stem: str, panel: int) -> list[tuple[str, list[float], list[float]]]:
         """Label, x and y of each line of a chart's panel."""
         lines = []

@@ -348,11 +348,7 @@ def run_session(
     for photo in photos:
         shots.append(open_shot(file, photo, base, start))
         advance(OPEN_PERCENT * len(shots) // len(photos))
-    focal_px = float(np.median([shot.focal_length_px for shot in shots]))
-    if fixed is None:
-        base = replace(base, focal_length_px=focal_px)
-    else:
-        base = fixed.camera
+    base = _first_camera(base, fixed, [shot.focal_length_px for shot in shots])
     if shots[0].sky.air is None:
         air = None
     else:
@@ -405,6 +401,15 @@ class FixedCamera:
     psf: StarPsf
     light: LightFit
     pixels: PixelFit
+
+
+def _first_camera(base: Camera, fixed: FixedCamera | None, focal_px: Sequence[float]) -> Camera:
+    """The camera that a fit begins with: the fixed one, else that of the bench file with the median
+    of the photographs' focal lengths.
+    """
+    if fixed is not None:
+        return fixed.camera
+    return replace(base, focal_length_px=float(np.median(focal_px)))
 
 
 def _linear(shot: Shot, photo: Photograph, power: float) -> Shot:

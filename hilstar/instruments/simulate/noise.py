@@ -581,10 +581,17 @@ def _by_magnitude(
     star_e = zero_e_per_s * file.config.tracker.exposure_s * flux_ratio(v_mag)
     under_e = np.full(len(v_mag), background_e)
     noise = star.noise(star_e, under_e, finder)
-    detectable = noise["detection"][::BETWEEN] >= UNSEEN
-    shown = slice(0, int(detectable.sum()) * BETWEEN + 1, BETWEEN)
+    shown = _until_unseen(noise["detection"])
     reached_px = _measured_by_rate(star, noise["star_e"][shown], background_e, finder, rng)
     return _ByMagnitude(star, v_mag, star_e, under_e, noise, shown, reached_px)
+
+
+def _until_unseen(detection: FloatArray) -> slice:
+    """The stars of a table's rows, of all by their falling probability (n,): to the first row that
+    is hardly detected.
+    """
+    detectable = detection[::BETWEEN] >= UNSEEN
+    return slice(0, int(detectable.sum()) * BETWEEN + 1, BETWEEN)
 
 
 def _by_channel(

@@ -618,11 +618,11 @@ class TrackerBackground:
     """Light between the stars on a bench's detector: what is the same in every view, zodiacal light
     by direction, sky glow.
 
-    Pixels of a `mosaic`, where the tracker has one, have their own channel's, else that of all
-    channels. Zodiacal light and glow are computed at LATTICE places along each side of the
-    detector, each with its pixel's solid angle. Where the table of zodiacal light is blank, near
-    the Sun, a field is refused (InputError); without `refuse` the nearest tabled light is drawn,
-    and a warning says so once until the field has left that part of the sky.
+    Pixels of a mosaic have their own channel's, of a tracker without one that of all channels.
+    Zodiacal light and glow are computed at LATTICE places along each side of the detector, each
+    with its pixel's solid angle. Where the table of zodiacal light is blank, near the Sun, a field
+    is refused (InputError); without `refuse` the nearest tabled light is drawn, and a warning says
+    so once until the field has left that part of the sky.
     """
 
     def __init__(
@@ -632,11 +632,10 @@ class TrackerBackground:
         camera: Camera,
         *,
         refuse: bool = True,
-        mosaic: bool = True,
         moving: "MovingSky | None" = None,
     ) -> None:
         tracker = config.tracker
-        self._bayer = tracker.detector.bayer if mosaic else None
+        self._bayer = tracker.detector.bayer
         if self._bayer is None:
             channels: tuple[Optics, ...] = (bench_optics(tracker, folder),)
         else:

@@ -19,6 +19,7 @@ from hilstar.basics.rotation import (
     from_rotation_vectors,
     multiply,
     normalise,
+    to_matrix,
     to_rotation_vector,
 )
 from hilstar.basics.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
@@ -27,6 +28,7 @@ from hilstar.display.identity import MonitorIdentity
 from hilstar.instruments.calibrate.alignment import (
     AxesArcsec,
     Residual,
+    _causes,
     _explained,
     align,
     corrected,
@@ -186,6 +188,20 @@ def test_a_reference_frame_of_date_is_named(rng):
     assert any(
         "reference frame" in cause and "1.3e+03 arcsec" in cause for cause in found.residual.causes
     )
+
+
+@pytest.mark.parametrize(("attitudes", "repeats"), [(5, 1), (6, 1), (5, 4), (6, 4)])
+def test_a_cause_is_named_from_six_attitudes_on_however_often_each_is_repeated(
+    rng, attitudes, repeats
+):
+    """A reference frame that is turned by 1000 arcsec, without noise."""
+    commanded = np.repeat(commanded_of(rng, attitudes), repeats, axis=0)
+    group = np.repeat(np.arange(attitudes), repeats)
+    turn_rad = np.array([0.0, 600.0, 800.0]) / ARCSEC_PER_RAD
+    residual_rad = np.stack([to_matrix(q) @ turn_rad for q in commanded])
+    place = np.linspace(-0.5, 0.5, len(commanded))
+    causes = _causes(commanded, None, residual_rad, np.array([1.0, 0.0, 0.0, 0.0]), group, place)
+    assert any("turned by 1e+03 arcsec" in cause for cause in causes) == (attitudes == 6)
 
 
 def test_a_drift_is_named_with_its_size_though_its_ends_are_left_out(rng):

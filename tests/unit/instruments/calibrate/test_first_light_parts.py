@@ -63,6 +63,7 @@ from hilstar.instruments.calibrate.scale import MeasuredScale
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.optics.camera import Camera
 from tests.support.closed_camera import (
+    BITS,
     EXPOSURE_S,
     FULL_DN,
     SIGMA_PX,
@@ -561,3 +562,6 @@ def test_a_file_is_named_from_the_bench_file_s_folder(tmp_path, folder, name):
     context = replace(closed_context(tmp_path / folder, ClosedCamera()), session=tmp_path / "s")
     (change,) = context.names("collimator", "geometry", tmp_path / "s" / "geometry.toml")
     assert (change.table, change.key, change.after) == ("collimator", "geometry", name)
+    assert change.before is None
+    (again,) = context.change("monitor", "bits", 12)
+    assert (again.before, again.after) == (BITS, 12)

@@ -42,6 +42,7 @@ from hilstar.server.screen.screen import marker_light
 from hilstar.tracker.centroids import noisiest_background
 from hilstar.tracker.rounding import rounding_rms
 from hilstar.tracker.settings import DetectorSettings
+from tests.support.card_texts import drawn_figures
 from tests.support.closed_camera import (
     AXIS_PX,
     BITS,
@@ -411,6 +412,20 @@ STARS = {
 }
 E_PER_S_A_DN = GAIN_E_PER_DN
 FILED_WHITE_E_PER_S = float(CLOSED["render"]["flux_at_white_e_per_s"])
+
+
+def test_white_is_not_measured_where_stars_say_that_light_changes_over_the_screen(tmp_path):
+    """By a tenth from the middle to either side, which their noise of half a percent does not
+    hide.
+    """
+    even = np.broadcast_to(1 + 0.1 * np.linspace(-1, 1, SCREEN_PX[0]), SCREEN_PX[::-1])
+    white_dn_per_s = FILED_WHITE_E_PER_S / E_PER_S_A_DN
+    camera = ClosedCamera(power_of(2.2), white_dn_per_s, even=even)
+    with drawn_figures():
+        outcome = scale(closed_context(tmp_path, camera, STARS))
+    assert outcome.verdict == "failed"
+    assert "of it follows the place on the screen: measure that (--again" in outcome.line
+    assert "nothing was changed" not in outcome.line
 
 
 @pytest.mark.parametrize("share", [1.0, 1.07, 0.9])

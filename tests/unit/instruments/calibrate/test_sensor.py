@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import math
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,7 @@ from hilstar.server.bench.star_rates import bench_optics
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import DetectorSettings
 from tests.support.benches import SMALL_BENCH
+from tests.support.card_texts import drawn_figures
 from tests.support.commands import run_hilstar_here
 from tests.support.refusals import refusal
 
@@ -227,6 +229,8 @@ def test_a_bench_takes_the_tables_that_are_written(tmp_path):
     ]
     assert all(file.is_file() for file in files)
     _, tables = files[0].read_text().split("[tracker]\n")
+    # beside it, wherever both are moved
+    assert tables.startswith('quantum_efficiency = "camera_qe.csv"\n')
     bench = SMALL_BENCH.replace('quantum_efficiency = "ccd47-20"\n', "").replace(
         "[tracker]\n", "[tracker]\n" + tables.split("[")[0]
     )
@@ -260,6 +264,30 @@ def test_the_command_takes_its_darks_up_to_the_next_option(tmp_path, monkeypatch
         assert result.returncode == 2
         assert words in result.stderr
         assert not Path("other.toml").exists()
+
+
+def test_an_error_stands_beside_its_value_as_a_comment(tmp_path):
+    """And one share of all wavelengths in place of a curve."""
+    found = SensorFile(
+        {"gain_e_per_dn": 3.99, "read_noise_e": 2.5},
+        {"gain_e_per_dn": 0.0213},
+        ((530.0, 0.625),),
+        ("dsnu_e: too few images",),
+    )
+    with drawn_figures():
+        files = write_sensor(tmp_path / "camera.toml", found, "a test")
+    assert files[0] == tmp_path / "camera.toml" and not (tmp_path / "camera_qe.csv").exists()
+    text = files[0].read_text()
+    assert text.splitlines() == [
+        "# a test",
+        "# dsnu_e: too few images",
+        "[tracker]",
+        "quantum_efficiency = 0.625",
+        "[tracker.detector]",
+        "gain_e_per_dn = 3.99  # +- 0.021",
+        "read_noise_e = 2.5",
+    ]
+    assert tomllib.loads(text)["tracker"]["detector"] == found.keys
 
 
 def test_an_import_tells_what_it_wrote_and_what_it_passed_over(tmp_path, monkeypatch):

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import erfa
 import numpy as np
 import pytest
 from astropy.coordinates import get_body, solar_system_ephemeris
@@ -294,3 +295,19 @@ def test_planets_are_where_astropy_has_them_from_the_earth() -> None:
             limit_rad = MOON_ERROR_RAD if body == "moon" else PLANET_ERROR_RAD
             assert np.linalg.norm(np.cross(direction, wanted)) < limit_rad
             assert direction @ wanted > 0
+
+
+def test_planets_are_seen_shifted_towards_where_the_earth_moves() -> None:
+    """By 20.5 arcsec times the sine of the angle from there, which is less than their elements'
+    error: against their own directions at rest.
+    """
+    t_ns = ns("2020-09-20T20:00:00")
+    seen = planets_seen(t_ns)
+    jd = t_ns / 86_400e9
+    about_sun, about_centre = erfa.epv00(2440587.5, jd)
+    velocity_c = about_centre["v"] * 1.495978707e8 / 86_400 / 299_792.458
+    for number, name in ((1, "Mercury"), (2, "Venus"), (4, "Mars"), (6, "Saturn")):
+        at_rest = erfa.plan94(2440587.5, jd, number)["p"] - about_sun["p"]
+        at_rest /= np.linalg.norm(at_rest)
+        across_c = velocity_c - (velocity_c @ at_rest) * at_rest
+        np.testing.assert_allclose(seen[name] - at_rest, across_c, atol=2e-8)

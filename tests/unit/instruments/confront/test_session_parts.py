@@ -47,8 +47,10 @@ from hilstar.instruments.confront.session import (
     MAX_TONE_STEP,
     PIVOT_NM,
     WIDE_PX,
+    FixedCamera,
     _channel_mag,
     _field,
+    _first_camera,
     _linear,
     _middles,
     _reach_px,
@@ -611,6 +613,8 @@ def test_a_psf_changes_over_the_field_by_as_much_as_its_stars_tell(stars, terms,
     psf = fit_psf(stamps_of(places_px, 0.8, 0.9), *places_px.T, (800, 600), 2.0)
     assert psf.covariance.shape == (3, terms)
     assert psf.covariance[:, 0] == pytest.approx([0.64, 0.81, 0.0], abs=0.05 * 0.81)
+    # which, with their sigma and the colour, are fitted from the second round on
+    assert (psf.colour, psf.wing_share, psf.wing_sigma_px) == (0.0, 0.05, 2.0)
 
 
 def star_field(count: int, wide: int = 0) -> Photograph:
@@ -653,3 +657,13 @@ def test_the_ten_brightest_stars_tell_the_focus(wide, is_taken, tmp_path, monkey
     else:
         with pytest.raises(InputError, match="px wide; focus the lens"):
             sessions.open_shot(bench(tmp_path), photo, CAMERA, None)
+
+
+def test_a_camera_is_fitted_from_the_median_focal_length_of_its_photographs_unless_it_is_fixed():
+    focal_px = [2000.0, 2500.0, 2040.0]
+    begun = _first_camera(CAMERA, None, focal_px)
+    assert (begun.focal_length_px, begun.principal_point_px) == (2040.0, (410.0, 290.0))
+    session = a_session()
+    fixed_camera = replace(CAMERA, focal_length_px=2222.0)
+    fixed = FixedCamera(fixed_camera, session.psf, session.light, session.pixels)
+    assert _first_camera(CAMERA, fixed, focal_px) is fixed_camera

@@ -324,3 +324,19 @@ def test_the_zero_point_is_that_of_stars_of_the_sun_s_colour() -> None:
     # none is as near as a tenth: the nearest
     red = stars_of(rates_e_per_s, v_mag, [1.4, 1.5, 1.9, 1.5, 1.2])
     assert zero_point_mag(red) == pytest.approx(4 + 2.5 * math.log10(5))
+
+
+def test_a_budget_of_temporal_codes_is_of_the_frames_of_an_exposure(bench_with, monkeypatch):
+    """Three magnitudes below white: of eight frames the mean light is off by an eighth or so of
+    what one frame's codes leave.
+    """
+    monkeypatch.setattr(budgets, "PHASES", 4)
+    monkeypatch.setattr(budgets, "STEP_MAG", 3.0)
+    monkeypatch.setattr(budgets, "MAX_BELOW_WHITE_MAG", 3.0)
+    off_mag = {}
+    for frames in (1, 8):
+        text = f'[render]\nquantisation = "temporal"\ncycle_frames = {frames}\n'
+        (_, _), (mag, errors) = budgets._errors(bench_with(text))
+        assert mag == 3.0
+        off_mag[frames] = errors.flux_rms_mag
+    assert off_mag[8] < off_mag[1] / 4

@@ -21,6 +21,7 @@ from hilstar.instruments.simulate.noise import (
     NoiseBudget,
     NoisyStar,
     Table,
+    _until_unseen,
     between,
     measured_px,
     nea_arcsec,
@@ -275,6 +276,13 @@ def test_the_tracker_finds_as_many_simulated_stars_as_the_threshold_s_model_says
         image = image.reshape(TILES * TILE_PX, -1)
         found = find_stars(Detector(star.detector, image.shape).expose(image, 1.0, rng), finder)
         assert len(found) / TILES**2 == pytest.approx(wanted, abs=SHARE_ERROR)
+
+
+@pytest.mark.parametrize(("rows", "last"), [([1.0, 0.4, 0.011], 0.009), ([1.0, 0.4], 0.0099)])
+def test_a_table_of_magnitudes_ends_with_the_first_row_of_under_a_percent(rows, last):
+    """Four stars stand between two rows."""
+    detection = np.concatenate([np.repeat(rows, 5), np.full(11, last)])
+    assert detection[_until_unseen(detection)].tolist() == [*rows, last]
 
 
 def test_stars_between_rows_have_the_bounds_of_their_own():

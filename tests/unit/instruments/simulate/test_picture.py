@@ -157,3 +157,13 @@ def test_of_two_discs_the_brighter_shows(order, greys, row):
     places = (np.array([10, 10])[kept], np.array([10, 13])[kept])
     drawn = _discs((21, 30), places, np.full(2, 4.0), np.array(greys)[kept])
     assert drawn[10, 8:16].tolist() == row
+
+
+@pytest.mark.parametrize("size_px", [(12, 40), (40, 12)])
+def test_a_disc_in_a_corner_of_an_oblong_frame_is_drawn_as_far_as_that_goes(size_px):
+    """Of 2 px: three pixels of its middle row and column, and two of those beside."""
+    last = np.array(size_px) - 1
+    drawn = _discs(size_px, (last[:1], last[1:]), np.array([2.0]), np.array([0.7]))
+    corner = drawn[-3:, -3:]
+    assert corner.tolist() == [[0, 0, 0.7], [0, 0.7, 0.7], [0.7, 0.7, 0.7]]
+    assert np.count_nonzero(drawn) == 6

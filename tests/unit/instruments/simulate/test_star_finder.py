@@ -76,6 +76,11 @@ def test_each_centroider_places_stars_where_they_are_also_aside_and_at_the_edge(
     assert np.isfinite(found).all()
     assert np.abs(found[:, :2] - np.array(places[:2]).T).max() < BIAS_PX[kind]
     assert 0 <= found[0, 2] < 1.5 and abs(found[1, 2] - 30.2) < BIAS_PX[kind]
+    # a window's are where they were found, and so are none
+    windowed = finder.find(image, x_px, y_px)
+    assert (finder.placed(windowed, image, (x_px, y_px), kind) is windowed) == (kind == "window")
+    nowhere = finder.find(0 * image, x_px, y_px)
+    assert finder.placed(nowhere, 0 * image, (x_px, y_px), kind) is nowhere
 
 
 @pytest.mark.parametrize(("bayer", "least"), [(None, 1.0), ("rggb", 0.25)])

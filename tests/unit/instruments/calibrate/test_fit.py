@@ -386,6 +386,18 @@ def test_the_black_level_is_as_well_known_as_white_is(tmp_path, rng):
     assert 0.7 < np.sqrt(np.mean(np.square(sigmas))) < 1.4
 
 
+def test_a_black_level_that_is_read_badly_is_known_by_the_levels_above_it(tmp_path):
+    """Its own three readings are 0.0005 of white too bright, and known to 0.0006."""
+    codes = np.concatenate([[0], np.rint(np.geomspace(8, 255, 24))]).astype(int)
+    rows = [(0, "w", value) for value in (0.5e-3, 1.5e-3, 2.5e-3)]
+    for code in codes[1:].tolist():
+        light = (code / 255) ** 2.2 + 1e-3
+        rows += [(code, "w", share * light) for share in (0.999, 1.0, 1.001)]
+    fit = fit_channel(read_measurements(write_readings(tmp_path / "m.csv", rows)), "w")
+    assert fit.black_error < 1e-4
+    assert abs(fit.black - 1e-3) < 2 * fit.black_error
+
+
 def test_a_calibration_has_as_many_degrees_of_freedom_as_readings_less_one_a_level(tmp_path, rng):
     """Of each level's readings its mean takes one."""
     path = measure_plan(tmp_path / "m.csv", CURVES["srgb"], rng, black=1e-3, repeats=4)

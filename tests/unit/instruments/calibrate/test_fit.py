@@ -386,6 +386,45 @@ def test_the_black_level_is_as_well_known_as_white_is(tmp_path, rng):
     assert 0.7 < np.sqrt(np.mean(np.square(sigmas))) < 1.4
 
 
+def test_a_black_level_that_is_read_badly_is_known_by_the_levels_above_it(tmp_path):
+    """Its own three readings are 0.0005 of white too bright, and known to 0.0006."""
+    codes = np.concatenate([[0], np.rint(np.geomspace(8, 255, 24))]).astype(int)
+    rows = [(0, "w", value) for value in (0.5e-3, 1.5e-3, 2.5e-3)]
+    for code in codes[1:].tolist():
+        light = (code / 255) ** 2.2 + 1e-3
+        rows += [(code, "w", share * light) for share in (0.999, 1.0, 1.001)]
+    fit = fit_channel(read_measurements(write_readings(tmp_path / "m.csv", rows)), "w")
+    assert fit.black_error < 1e-4
+    assert abs(fit.black - 1e-3) < 2 * fit.black_error
+
+
+def test_no_black_is_below_zero_though_the_levels_above_it_say_so(tmp_path):
+    """All of them are 0.001 of white too dark, where black reads 0 and is known to 0.003."""
+    rows = ["code,channel,value,sigma", "0,w,0,0.003"]
+    for code in np.rint(np.geomspace(18, 255, 30)).astype(int).tolist():
+        light = (code / 255) ** 2.2 - 1e-3
+        rows.append(f"{code},w,{light!r},{1e-3 * light!r}")
+    path = tmp_path / "m.csv"
+    path.write_text("\n".join(rows) + "\n")
+    assert fit_channel(read_measurements(path), "w").black == 0.0
+
+
+def test_a_common_error_that_no_response_has_is_found_and_taken_off_the_levels(tmp_path):
+    """Of 2 % up and down by turns, in light that is known to 0.1 %."""
+    codes = np.linspace(0, 255, 16).astype(int)
+    light = (codes / 255) ** 2.2
+    common = 0.02 * light * np.where(np.arange(16) % 2, 1, -1)
+    rows = ["code,channel,value,sigma,common_1"]
+    readings = np.column_stack([light + common, common]).tolist()
+    for code, (value, error) in zip(codes.tolist(), readings, strict=True):
+        rows.append(f"{code},w,{value!r},{1e-3 * value + 1e-6!r},{error!r}")
+    path = tmp_path / "m.csv"
+    path.write_text("\n".join(rows) + "\n")
+    fit = fit_channel(read_measurements(path), "w")
+    assert np.abs(fit.level_off).max() < 1e-3
+    assert np.abs(curve_errors(fit, CURVES["gamma"])).max() < 5e-3
+
+
 def test_a_calibration_has_as_many_degrees_of_freedom_as_readings_less_one_a_level(tmp_path, rng):
     """Of each level's readings its mean takes one."""
     path = measure_plan(tmp_path / "m.csv", CURVES["srgb"], rng, black=1e-3, repeats=4)

@@ -9,9 +9,21 @@ import numpy as np
 import pytest
 
 from hilstar.basics.rotation import from_rotation_vector, to_matrix
-from hilstar.instruments.compare.compare_skies import MAX_MOVE_SIGMAS, _differences
+from hilstar.instruments.compare.compare_skies import (
+    MAX_MOVE_SIGMAS,
+    PIXEL_ERROR,
+    _differences,
+    _SkyFit,
+    _unexplained,
+)
 from hilstar.instruments.compare.sky_comparison import Limits
-from hilstar.instruments.compare.star_fit import Seeds, _blended, _has, _sigma_px
+from hilstar.instruments.compare.star_fit import (
+    RIPPLE_SHARE,
+    Seeds,
+    _blended,
+    _has,
+    _sigma_px,
+)
 from hilstar.instruments.simulate.eye_picture import _blocks
 from hilstar.instruments.simulate.noise import found_share
 from hilstar.instruments.simulate.simulator import FaultyExposure
@@ -19,6 +31,7 @@ from hilstar.instruments.verify.measure import DECENTRED, HIGHER, LENS, TILT, St
 from hilstar.instruments.verify.summary import _by_magnitude
 from hilstar.instruments.verify.verdict import DisplayErrors
 from hilstar.optics.layers.truth import TRUTH_DTYPE
+from hilstar.optics.psf import GaussianPsf
 from hilstar.testing import compare
 from tests.support.refusals import refusal
 
@@ -178,3 +191,62 @@ def test_a_field_is_seen_in_the_pieces_in_which_nothing_covers_it(monkeypatch):
     )
     assert total[0, 0] == pytest.approx(7.0)
     assert open_s == pytest.approx(0.5)
+
+
+STAR_PX = (15.0, 20.0)
+
+
+def fits_of(golden: np.ndarray, frame: np.ndarray) -> tuple[_SkyFit, _SkyFit]:
+    """Two images as a star at STAR_PX explains them."""
+    places_px = np.array([STAR_PX])
+    psf = GaussianPsf((1.0, 1.0))
+    return _SkyFit(golden, places_px, psf), _SkyFit(frame, places_px, psf)
+
+
+def spikes(*values: tuple[float, int, int]) -> np.ndarray:
+    """Light in single pixels: how much, x and y."""
+    light = np.zeros((48, 64))
+    for value, x, y in values:
+        light[y, x] = value
+    return light
+
+
+@pytest.mark.parametrize("peaks", [(1e8, 1e8), (1e8, 0.0), (0.0, 1e8)])
+def test_light_far_from_a_bright_star_of_either_image_is_none_below_its_rounding(peaks):
+    """A half of what is unexplained is none by itself, so that it has to be twice the rounding."""
+    golden, frame = (sky_of((peak, *STAR_PX)) for peak in peaks)
+    fit, moved = fits_of(golden, frame)
+    limit = 2 * PIXEL_ERROR * max(fit.flux.max(), moved.flux.max())
+    for share, count in ((0.9, 0), (1.1, 1)):
+        places_px, _ = _unexplained(spikes((share * limit, 50, 30)), fit, moved)
+        assert len(places_px) == count
+
+
+@pytest.mark.parametrize("is_in_frame", [True, False])
+def test_light_upon_brighter_light_of_either_image_is_none_below_its_ripple(is_in_frame):
+    dark = sky_of((1.0, *STAR_PX))
+    lit = dark.copy()
+    lit[20:40, 40:60] = 1e8
+    fit, moved = fits_of(dark, lit) if is_in_frame else fits_of(lit, dark)
+    limit = 2 * RIPPLE_SHARE * 1e8
+    for share, count in ((0.9, 0), (1.1, 1)):
+        places_px, _ = _unexplained(spikes((share * limit, 50, 30)), fit, moved)
+        assert len(places_px) == count
+
+
+def test_light_beside_twice_as_much_is_the_same_star_s():
+    fit, moved = fits_of(SKY, SKY)
+    for value, count in ((45.0, 1), (55.0, 2)):
+        light = spikes((100.0, 50, 30), (value, 54, 30))
+        places_px, _ = _unexplained(light, fit, moved)
+        assert len(places_px) == count
+
+
+def test_a_star_in_a_hollow_has_the_light_of_its_pixel():
+    """Its fit, by light below 0 all about it, is below 0."""
+    fit, moved = fits_of(SKY, SKY)
+    light = spikes((100.0, 50, 30))
+    light[27:34, 47:54] -= 30.0
+    places_px, flux = _unexplained(light, fit, moved)
+    assert places_px.tolist() == [[50.0, 30.0]]
+    assert flux.tolist() == [70.0]

@@ -21,8 +21,15 @@ from hilstar.attitude.wire.endpoint import AllowedSenders
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.scheduling import HOST_CLOCK
-from hilstar.server.gige.camera import GigECamera, _broadcast_of, camera_address
+from hilstar.server.gige.camera import (
+    MAX_RESENT_PER_S,
+    GigECamera,
+    _broadcast_of,
+    camera_address,
+)
+from hilstar.server.gige.control import MAX_RESENT
 from hilstar.server.gige.registers import CameraIdentity, CameraSettings
+from tests.support.fake_clock import FakeClock
 from tests.support.gige_client import (
     CONTROL,
     DISCOVER,
@@ -123,6 +130,7 @@ def test_a_single_frame_is_one_and_an_exposure_begun_before_the_start_is_none():
         wait_for(lambda: made.wanted, "the camera streams")
         made.take(dn, before_ns)
         made.take(dn + 7, time.monotonic_ns())
+        assert not made.wanted
         made.take(dn + 8, time.monotonic_ns())
         number, _, image = client.image(SIDE_PX, SIDE_PX)
         assert number == 1 and (image == 7).all()
@@ -219,6 +227,30 @@ def test_only_the_newest_images_are_sent_again():
             lambda: made.counts.resent == resent_before + 1,
             "the one that was sent again is counted",
         )
+
+
+def test_what_is_asked_for_again_counts_by_its_packets_though_the_image_has_fewer():
+    """50 000 in a second and no more."""
+    clock = FakeClock(time.monotonic_ns())
+    requests, rest = divmod(MAX_RESENT_PER_S, MAX_RESENT)
+    beyond = 5000  # of an image of 90 packets
+    with served_camera(clock=clock) as made, streaming(made) as client:
+        made.take(np.zeros((SIDE_PX, SIDE_PX), np.uint16), clock.now_ns())
+        number, *_ = client.block()
+        client.read(PRIVILEGE)  # whatever was asked for again before is then sent
+        clock.work(1e9)
+        resent_before = made.counts.resent
+        asked = [(beyond, MAX_RESENT)] * requests
+        asked += [(beyond, rest), (0, 1)]
+        for first, count in asked:
+            body = struct.pack(">HHII", 0, number, first, first + count - 1)
+            client.socket.sendto(command(RESEND, body, 999, flags=0), (client.address, 3956))
+        client.read(PRIVILEGE)
+        assert made.counts.resent == resent_before
+        clock.work(1e9)
+        client.socket.sendto(command(RESEND, body, 999, flags=0), (client.address, 3956))
+        client.read(PRIVILEGE)
+        assert made.counts.resent == resent_before + 1
 
 
 def test_another_clients_address_is_refused_over_the_wire():

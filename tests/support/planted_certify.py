@@ -322,10 +322,10 @@ DETECTOR = "[tracker.detector]\nread_noise_e = 15\n"
 
 
 def coverage_by_images(
-    benches: int, seed: int, after: After | None = None
+    benches: int, seed: int, after: After | None = None, tables: str = ""
 ) -> dict[tuple[str, str], Counted]:
     """The same by images of the tracker, each drawn: the truth is a file, and hilstar's own twin
-    draws it.
+    draws it. `tables` are further keys of [certify].
     """
     found: dict[tuple[str, str], Counted] = defaultdict(Counted)
     with pytest.MonkeyPatch.context() as patch:
@@ -333,7 +333,7 @@ def coverage_by_images(
         stars = None
         for number in range(benches):
             with TemporaryDirectory() as name:
-                folder, keys = Path(name), f"[certify]\nfields = 1\n{EXACT_LENS}{DETECTOR}"
+                folder, keys = Path(name), f"[certify]\nfields = 1\n{tables}{EXACT_LENS}{DETECTOR}"
                 # The virtual monitor warms up from its first image on: with a drift the truth file
                 # is not the first reading's.
                 one = replace(drawn(np.random.default_rng((seed, number))), drift_percent_per_h=0.0)

@@ -198,7 +198,8 @@ def test_waves_of_the_trackers_pixels_do_not_fit_the_noise_of_dots(number: int) 
 
 
 def test_images_give_places_as_well_as_thousands_of_dots_know_them() -> None:
-    found = coverage_by_images(1, 3)
+    # a third of the codes that a certificate reads: two images of each take half of the time
+    found = coverage_by_images(1, 3, tables="levels = 16\n")
     for axis in ("along", "across"):
         for region in REGIONS:
             # All but the one at the edge of the field; 0.003 px a star were 0.11 arcsec.

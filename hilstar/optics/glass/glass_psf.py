@@ -154,7 +154,9 @@ class Field:
 
             hull = ConvexHull(self.places_px)
             return [int(k) for k in hull.vertices]
-        along = self.places_px @ np.ptp(self.places_px, axis=0)
+        from_first_px = self.places_px - self.places_px[0]
+        farthest = np.square(from_first_px).sum(axis=1).argmax()
+        along = from_first_px @ from_first_px[farthest]
         return sorted({int(along.argmin()), int(along.argmax())})
 
     def within(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:

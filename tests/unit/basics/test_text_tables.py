@@ -318,6 +318,18 @@ def test_comments_between_rows_are_passed_over(table_file, comment):
     assert numbers(table_file(PLAIN.replace("1.5", f"{comment}\n1.5"))) == SAME
 
 
+@pytest.mark.parametrize(
+    ("comment", "names"),
+    [("# t_s x_px", ["t_s", "x_px"]), ("# 9.5 8.25", ["", ""]), ("# t_s 8.25", ["", ""])],
+)
+def test_a_comment_names_the_columns_below_it_unless_it_has_numbers(table_file, comment, names):
+    """Such a comment is a row that somebody left out."""
+    path = table_file(f"{comment}\n0.5 10.25\n1.5 11.25\n")
+    with open_table(path, "write a table", LIMIT) as table:
+        assert [column.header for column in table.columns] == names
+        assert table.header == table.commented == any(names)
+
+
 # What stands around a table, and what is said of it.
 SURROUNDINGS = {
     "title": (f"Log of today\n\n{PLAIN}", "2 lines above"),

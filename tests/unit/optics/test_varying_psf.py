@@ -1,5 +1,6 @@
 """What every PSF offers to those who draw, and that one that varies is drawn by it alone."""
 
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ from scipy import constants
 from hilstar.basics.errors import InputError
 from hilstar.display.footprints import FootprintMap
 from hilstar.display.render.backend import as_maps
+from hilstar.display.render.numpy_backend import NumpyBackend
 from hilstar.display.render.target import Target
 from hilstar.optics.extended import LightMap
 from hilstar.optics.psf import GaussianPsf, SampledPsf
@@ -77,6 +79,15 @@ def test_a_psf_of_any_class_that_varies_is_drawn_as_a_map_of_its_own_light():
     assert as_maps(plain, Target(SIZE_PX, psf)) is plain
     assert as_maps(sprites, Target(SIZE_PX, GaussianPsf((0.8, 0.8)))) is sprites
     image = made.image
+    assert image[:, : SIDE_PX // 2].sum() == pytest.approx(1e3, rel=1e-5)
+    assert image[:, SIDE_PX // 2 :].sum() == pytest.approx(1e4, rel=1e-5)
+
+
+def test_without_opengl_a_psf_of_any_class_that_varies_is_drawn_by_its_place():
+    psf = Vignetted((0.8, 0.8))
+    with closing(NumpyBackend(Target(SIZE_PX, psf))) as backend:
+        backend.draw(sprites_of(psf))
+        image = backend.linear()
     assert image[:, : SIDE_PX // 2].sum() == pytest.approx(1e3, rel=1e-5)
     assert image[:, SIDE_PX // 2 :].sum() == pytest.approx(1e4, rel=1e-5)
 

@@ -68,6 +68,15 @@ def test_a_clock_that_jumped_goes_on_where_the_earliest_of_three_says(settled, j
     assert settled.sender_ns(HOST0_NS) == HOST0_NS - jump_ns
 
 
+def test_samples_whose_jumps_differ_do_not_agree_on_one(settled):
+    """The two before are let go as they came, and the next three agree."""
+    counts = []
+    for k, jump_ms in enumerate((2000, 2000, 5000, 5000, 5000), SETTLED):
+        counts.append(len(settled.take(arrival(k, jump_ns=jump_ms * NS_PER_MS))))
+    assert counts == [0, 0, 2, 0, 3]
+    assert (settled.jumps, settled.correction_ns) == (1, 5 * NS_PER_S)
+
+
 def test_samples_in_doubt_are_let_go_when_nothing_has_followed_the_last(settled):
     jump_ns = 2 * NS_PER_S
     first, second = arrival(SETTLED, jump_ns=jump_ns), arrival(SETTLED + 20, jump_ns=jump_ns)

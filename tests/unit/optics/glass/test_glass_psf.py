@@ -339,6 +339,15 @@ def two_psfs():
     return glass_psf(glass, 0.0, np.array([0.1, 0.9]))
 
 
+@pytest.mark.parametrize("towards", [(3, 4), (1, 1), (1, 0), (0, 1), (1, -1), (2, -1), (1, -3)])
+def test_points_on_a_line_have_its_two_ends_and_each_is_its_own_whatever_its_slope(towards):
+    line_px = np.array([250.0, 200.0]) + np.outer([-50, -20, 10, 50], towards)
+    line_px = line_px[np.lexsort(line_px.T[::-1])]
+    field = Field(line_px)
+    assert sorted(field.hull_px.tolist()) == sorted(line_px[[0, -1]].tolist())
+    assert field(*line_px.T) == pytest.approx(np.eye(4), abs=1e-9)
+
+
 def test_a_glass_is_sampled_for_its_sharpest_psf_and_cut_for_its_widest(two_psfs):
     assert two_psfs.width_px == pytest.approx((0.5, 0.5), rel=0.02)
     half_px = two_psfs.footprint_px / 2

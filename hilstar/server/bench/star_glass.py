@@ -117,6 +117,12 @@ class StarGlass:
             spectra_shares[body] = self._through(bv_mag, np.full_like(bv_mag, np.nan), kind)
         return spectra_shares
 
+    def shares_of(self, stars: Stars, hip: IntArray) -> FloatArray:
+        """The same by Hipparcos numbers (n,) of `stars`, 0 for a body."""
+        order = np.argsort(stars.hip)
+        at = np.minimum(np.searchsorted(stars.hip, hip, sorter=order), len(order) - 1)
+        return self.shares(stars, np.where(hip > 0, order[at], -1))
+
     def _through(
         self, bv_mag: FloatArray, vi_mag: FloatArray, kind: FloatArray | None
     ) -> FloatArray:

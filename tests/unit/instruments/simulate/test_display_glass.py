@@ -75,9 +75,7 @@ def test_a_bare_detector_sees_what_the_tracker_would_all_over_the_field(relay_fi
     with Simulator(file) as simulator:
         exposure = simulator.expose(simulator.view(q, np.zeros(3)), None)
         table, glass = exposure.truth, simulator.glass
-        star_of = {hip: star for star, hip in enumerate(simulator.stars.hip.tolist())}
-        which = np.array([star_of[hip] for hip in table["hip"].tolist()])
-        shares = glass.shares(simulator.stars, which)
+        shares = glass.shares_of(simulator.stars, table["hip"])
         exact = glass.psf.stamps_at(table["x_px"], table["y_px"], shares, np.ones(len(table)))
     with (
         open_bench(file) as shown,

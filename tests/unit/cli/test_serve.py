@@ -74,6 +74,10 @@ def test_heads_are_served_from_one_source_and_their_ends_are_told(tmp_path, monk
     done = run_hilstar_here(*words, "--overwrite", "--json", cwd=tmp_path)
     assert done.returncode == 3 and json.loads(done.stdout) == {"heads": ENDS}
     assert runs[1].consoles == ()
+    # a token that no page takes is refused once, and not by each head's process
+    paged = (*words, "--overwrite", "--console", "127.0.0.1:0", "--token", "short")
+    refused = run_hilstar_here(*paged, cwd=tmp_path)
+    assert (refused.returncode, "token" in refused.stderr, len(runs)) == (2, True, 2)
 
 
 @pytest.mark.parametrize(("source", "of_packets"), [("", True), ('source = "42"\n', False)])

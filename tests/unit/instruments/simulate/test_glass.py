@@ -88,6 +88,17 @@ def test_a_star_s_shares_are_its_spectrum_times_the_quantum_efficiency(glass_fil
     assert found == pytest.approx(finer, abs=SHARES)
 
 
+def test_shares_by_hipparcos_number_are_those_of_the_star_in_whatever_order(glass_file):
+    """The catalogue has them by declination; light without a number has the mean spectrum."""
+    file = glass_file({"sky": {"faintest_v_mag": 3}})
+    glass = StarGlass(file, tracker_psf(file.config.tracker, file.folder))
+    stars = bench_stars(file.config, file.folder)
+    which = np.array([31, 0, 57, 4])
+    found = glass.shares_of(stars, np.append(stars.hip[which], 0))
+    assert np.array_equal(found, glass.shares(stars, np.append(which, -1)))
+    assert np.ptp(found, axis=0).max() > SHARES
+
+
 GLOW = """seed = 5
 [[fault]]
 kind = "glow"

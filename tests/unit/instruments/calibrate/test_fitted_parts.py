@@ -105,6 +105,9 @@ def test_a_reading_of_white_is_noisier_than_the_mean_of_four(white):
         mean=np.array([1.0, 100.0]),
     )
     assert levels.reading_noise(0.08) == pytest.approx(0.1)
+    # an exact black beside a white with its error is a reading with errors
+    assert replace(levels, stated=np.array([0.0, 3.0])).has_errors
+    assert not replace(levels, stated=np.zeros(2)).has_errors
 
 
 def test_readings_weigh_alike_unless_the_noise_of_each_is_known():

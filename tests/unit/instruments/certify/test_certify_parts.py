@@ -122,6 +122,8 @@ def test_an_input_s_freedom_is_written_where_it_is_finite():
 def test_a_figure_s_field_counts_from_0_and_its_star_has_its_own():
     stars = [reference_star(), reference_star(hip=71, field=2, third=1)]
     assert _place_of(stars, "flux", 1) == (71, 2, "middle third")
+    for third, region in enumerate(("left third", "middle third", "right third")):
+        assert _place_of([reference_star(third=third)], "place_along", 0)[2] == region
     assert _place_of(stars, "attitude_x", -1) == (None, 0, "field 0")
     assert _place_of(stars, "attitude_z", -3) == (None, 2, "field 2")
     assert _place_of(stars, "latency", 0) == (None, None, "screen")

@@ -15,7 +15,11 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.display.render.reference import linear_image
 from hilstar.instruments.compare import MAX_LINES, assert_same_sky, compare
-from hilstar.instruments.compare.compare_skies import compare_skies, read_frame_fits
+from hilstar.instruments.compare.compare_skies import (
+    compare_skies,
+    read_frame_fits,
+    read_truth_csv,
+)
 from hilstar.instruments.compare.report import ChartPanel
 from hilstar.instruments.compare.sky_comparison import CENTROID_PX, FLUX_MAG, Limits
 from hilstar.instruments.compare.star_fit import star_psf
@@ -458,3 +462,14 @@ def test_cubes_are_compared_by_their_sum_and_each_channel_by_itself():
     for name, channel in found.channels.items():
         off = [star.flux_error_mag for star in channel.bad]
         assert off == pytest.approx([errors_mag[name]] if name in errors_mag else [], abs=1e-4)
+
+
+def test_a_table_s_bodies_are_known_by_their_names_and_its_stars_by_their_numbers(tmp_path):
+    """One of stars alone may have no names."""
+    path = tmp_path / "truth.csv"
+    path.write_text("name,hip,x_px,y_px,electrons_per_s\nMars,0,1.5,2.25,300\n,71,3,4,5.5\n")
+    truth = read_truth_csv(path)
+    columns = ["name", "hip", "x_px", "y_px", "electrons_per_s"]
+    assert truth[columns].tolist() == [("Mars", 0, 1.5, 2.25, 300.0), ("", 71, 3.0, 4.0, 5.5)]
+    path.write_text("hip,x_px,y_px,electrons_per_s\n71,3,4,5.5\n")
+    assert read_truth_csv(path)["name"].tolist() == [""]

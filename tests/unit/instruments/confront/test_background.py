@@ -66,14 +66,16 @@ def test_a_block_full_of_a_star_s_light_is_as_its_neighbours(rng):
 
 
 def test_sources_come_by_their_peak_and_their_size():
-    """A wide one of two thirds of the peak before a narrow one, and that before a faint one."""
+    """A wide one of a third of the peak before a narrow one, but after one of eight times its
+    peak.
+    """
     size_px = (120, 160)
-    dn = spot(size_px, 40.0, 30.0, (1.0, 1.0), 90.0)
-    dn += spot(size_px, 100.0, 80.0, (4.0, 4.0), 25.0) + spot(size_px, 20.0, 90.0, (1.0, 1.0), 30.0)
+    dn = spot(size_px, 40.0, 30.0, (1.0, 1.0), 60.0) + spot(size_px, 20.0, 90.0, (1.0, 1.0), 400.0)
+    dn += spot(size_px, 100.0, 80.0, (4.0, 4.0), 25.0)
     found = find_sources(dn)
-    assert np.rint(found.places_px).tolist() == [[100, 80], [40, 30], [20, 90]]
-    wide, narrow, faint = found.snr
-    assert narrow > wide > faint
+    assert np.rint(found.places_px).tolist() == [[20, 90], [100, 80], [40, 30]]
+    bright, wide, narrow = found.snr
+    assert bright > narrow > wide
 
 
 @pytest.mark.parametrize(

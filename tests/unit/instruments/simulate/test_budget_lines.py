@@ -330,7 +330,7 @@ def test_a_budget_of_temporal_codes_is_of_the_frames_of_an_exposure(bench_with, 
     """Three magnitudes below white: of eight frames the mean light is off by an eighth or so of
     what one frame's codes leave.
     """
-    monkeypatch.setattr(budgets, "PHASES", 4)
+    monkeypatch.setattr(budgets, "PHASES", 2)
     monkeypatch.setattr(budgets, "STEP_MAG", 3.0)
     monkeypatch.setattr(budgets, "MAX_BELOW_WHITE_MAG", 3.0)
     off_mag = {}

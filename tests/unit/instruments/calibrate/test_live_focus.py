@@ -19,7 +19,7 @@ from hilstar.server.answers.star_widths import FocusCurve, sparkline
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import TWIN, bench_text
 from tests.support.closed_camera import ClosedCamera, closed_context, power_of
-from tests.support.commands import run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.fake_clock import FakeClock
 from tests.support.refusals import refusal
 from tests.support.senders import answers_over_udp, free_port
@@ -148,11 +148,9 @@ def test_a_pattern_is_shown_to_its_watcher_once_and_images_are_read_as_they_come
 def test_the_command_ends_with_the_best_image(benches, tmp_path):
     _, truth = benches
     bench = tmp_path / "truth-1.0.toml"
-    feed = f"tcp://127.0.0.1:{free_port()}"
-    words = ("--images", "3", "--exposure", str(EXPOSURE_S), "--feed", feed, "--json")
+    words = ("--images", "3", "--exposure", str(EXPOSURE_S), "--json")
     done = run_hilstar_here("calibrate", "focus", bench, "--virtual", truth(1.4).path, *words)
     assert done.returncode == 0, done.stderr
-    assert f"frames: {feed}" in done.stderr
     *figures, last = [json.loads(line) for line in done.stdout.splitlines()]
     best = last["best"]["figure"]
     assert [figure["number"] for figure in figures] == [1, 2, 3]
@@ -290,3 +288,11 @@ def test_a_streak_has_the_length_and_the_direction_of_the_motion(angle_deg):
 def test_round_dots_are_no_streak_wherever_in_their_pixels_they_are():
     length_px, _ = streak(*dragged_dots(0.0, 0.0))
     assert length_px < 0.2
+
+
+def test_a_virtual_bench_has_no_patterns_to_hand_on(benches, tmp_path):
+    _, truth = benches
+    bench = tmp_path / "truth-1.0.toml"
+    words = ("--virtual", truth(1.4).path, "--feed", f"tcp://127.0.0.1:{free_port()}")
+    refused = run_hilstar_here("calibrate", "focus", bench, *words)
+    assert_refused(refused, 2, "--feed", "shows nothing here")

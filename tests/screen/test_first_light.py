@@ -30,10 +30,12 @@ MEDIAN_MS = 4.0
 
 def told_by(process, word):
     """The next line of a session's stderr that has a word; fails where the session ends before."""
+    lines = []
     for line in process.stderr:
         if word in line:
             return line
-    raise AssertionError(f"the session ended without {word!r}")
+        lines.append(line)
+    raise AssertionError(f"the session ended without {word!r}: {''.join(lines)}")
 
 
 def save(line, screen):

@@ -245,7 +245,8 @@ class NoisyStar:
         rows[~has_place] = np.nan
         rows["star_e"] = star_e[:, 0, 0]
         rows["clipped_px"] = (~unclipped).sum(axis=-1).mean(axis=-1)
-        rows["snr"] = rows["star_e"] / rows["total_e"]
+        total_e: FloatArray = rows["total_e"]
+        rows["snr"] = star_e[:, 0, 0] / total_e
         above = self._above(star_e, under_e, (noise, sky), finder)
         rows["detection"] = found_share(above, finder.minimum_pixels)
 
@@ -750,12 +751,14 @@ def between(noise: Table, star_e: FloatArray) -> FloatArray:
     """Bounds of x and y [px] and the probability of detection of other stars (n,), (3, n),
     between those of a table.
     """
-    grid = -np.log(noise["star_e"])
+    grid: FloatArray = -np.log(noise["star_e"])
     at = -np.log(star_e)
     bounds = []
     for name in ("bound_x_px", "bound_y_px"):
-        bounds.append(np.exp(np.interp(at, grid, np.log(noise[name]))))
-    return np.stack([*bounds, np.interp(at, grid, noise["detection"])])
+        bound_px: FloatArray = noise[name]
+        bounds.append(np.exp(np.interp(at, grid, np.log(bound_px))))
+    detection: FloatArray = noise["detection"]
+    return np.stack([*bounds, np.interp(at, grid, detection)])
 
 
 def _rows(before: dict[str, Any], noise: Table, after: dict[str, Any]) -> list[dict[str, Any]]:
@@ -786,7 +789,8 @@ def _nea_rows(
         counts = []
         at_limit = []
         for field, curve in zip(fields, curves, strict=True):
-            count = int(np.searchsorted(field["v_mag"], limit, side="right"))
+            v_mag: FloatArray = field["v_mag"]
+            count = int(np.searchsorted(v_mag, limit, side="right"))
             counts.append(count)
             at_limit.append(curve[..., count - 1] if count else none)
         median = np.median(at_limit, axis=0).ravel().tolist()

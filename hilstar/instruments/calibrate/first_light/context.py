@@ -137,7 +137,13 @@ class StepOutcome:
     def checked(self) -> "StepOutcome":
         """This outcome; failed, and without its changes, where a figure is at an end of its
         model.
+
+        A light map or a scale that stars contradict a little is nearer than what it replaces, so a
+        failed step may have changes: its line then names their keys.
         """
+        if self.verdict == "failed" and self.changes:
+            keys = ", ".join(f"[{change.table}] {change.key}" for change in self.changes)
+            return dataclasses.replace(self, line=f"{self.line}; set all the same: {keys}")
         at_end = [figure for figure in self.fitted if figure.is_at_end]
         if self.verdict != "done" or not at_end:
             return self

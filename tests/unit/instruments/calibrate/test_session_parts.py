@@ -14,6 +14,7 @@ from hilstar.instruments.calibrate.first_light import session
 from hilstar.instruments.calibrate.first_light.context import (
     DarkSubtracted,
     FittedFigure,
+    KeyChange,
     StepContext,
     StepOutcome,
     StepRecord,
@@ -213,6 +214,19 @@ def test_only_what_was_done_fails_by_a_figure_at_an_end(verdict):
     else:
         assert (outcome.verdict, outcome.line) == (verdict, "measured")
     assert StepOutcome(verdict, "measured", fitted=(inside,)).checked().verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("verdict", "line"),
+    [
+        ("done", "measured"),
+        ("failed", "measured; set all the same: [render] flux_at_white_e_per_s"),
+    ],
+)
+def test_a_failed_step_names_the_keys_that_it_set(verdict, line):
+    change = KeyChange(table="render", key="flux_at_white_e_per_s", before=1.0, after=2.0)
+    outcome = StepOutcome(verdict, "measured", changes=(change,)).checked()
+    assert (outcome.verdict, outcome.line, outcome.changes) == (verdict, line, (change,))
 
 
 @pytest.mark.parametrize(("peak", "is_bright"), [(0.81, True), (0.79, False)])

@@ -39,18 +39,28 @@ def told_by(process, word):
 
 
 def save(line, screen):
-    """Do what a session asks: save the tracker's image under the name that it says."""
+    """Do what a session asks: save the tracker's image under the name that it says.
+
+    A person looks at the screen first: a frame that is still on its way to it is not photographed.
+    """
+    standing(screen)
     plain_camera.take([str(screen.file), re.search(r"as (\S+\.png) ", line)[1], "--reversed"])
+
+
+def standing(screen):
+    """What is on the screen once it has stood still for a while."""
+    for _ in range(500):
+        before = screen.pixels()
+        time.sleep(0.04)
+        if (screen.pixels() == before).all():
+            return before
+    raise AssertionError("nothing stands still on the screen")
 
 
 def settled(screen):
     """What is on the screen once something has been there for a while."""
-    for _ in range(100):
-        before = screen.pixels()
-        time.sleep(0.2)
-        if before.any() and (screen.pixels() == before).all():
-            return before
-    raise AssertionError("nothing stands still on the screen")
+    wait_for(lambda: standing(screen).any(), "something that stands still on the screen")
+    return standing(screen)
 
 
 def test_a_person_tells_the_mounting_by_a_key_and_saves_the_images(screen, tmp_path):

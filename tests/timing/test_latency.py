@@ -70,7 +70,7 @@ def still_sky(screen: Screen, folder: Path, kind: str):
             wait_for(
                 lambda: (
                     process.poll() is not None
-                    or (ledger.exists() and ledger.stat().st_size > 20_000)
+                    or (ledger.exists() and ledger.stat().st_size > 5_000)
                 )
             )
             assert process.poll() is None

@@ -150,6 +150,7 @@ class OutputState:
         return {
             "name": self.name,
             "mode_px": self.mode_px,
+            "refresh_hz": self.refresh_hz or None,
             "preferred_px": self.preferred_px,
             "transform": self.transform,
             "rotated": self.rotated,
@@ -162,7 +163,10 @@ class OutputState:
     def line(self) -> str:
         """The output for a person."""
         width, height = self.mode_px
-        parts = [f"{self.name}, {width} x {height}"]
+        mode = f"{width} x {height}"
+        if self.refresh_hz:
+            mode += f" at {self.refresh_hz:.2f} Hz"
+        parts = [f"{self.name}, {mode}"]
         for name, value in sorted((self.properties or {}).items()):
             parts.append(f"{name} {_words(value)}")
         if not self.properties:

@@ -126,6 +126,7 @@ def test_a_ledger_has_of_an_output_what_may_change_its_frames():
     state = replace(
         PLAIN,
         mode_px=(1280, 720),
+        refresh_hz=59.95,
         transform=(0.8, 0, 0, 0, 0.8, 0, 0, 0, 1),
         rotated=True,
         properties={"TearFree": "on"},
@@ -195,4 +196,8 @@ def test_an_output_s_line_and_fields_have_its_properties():
     assert (
         state.fields()["size_mm"] == (598, 336) and state.fields()["properties"] == state.properties
     )
-    assert PLAIN.line().endswith("no properties")
+    assert PLAIN.line() == "DP-1, 1920 x 1080; no properties"
+    assert PLAIN.fields()["refresh_hz"] is None
+    known = replace(PLAIN, refresh_hz=59.951)
+    assert known.line() == "DP-1, 1920 x 1080 at 59.95 Hz; no properties"
+    assert known.fields()["refresh_hz"] == 59.951

@@ -105,8 +105,10 @@ def test_doctor_lists_outputs_with_their_properties_and_what_is_wrong(here):
         told = run_hilstar_here("doctor")
         listed = json.loads(run_hilstar_here("doctor", "--json").stdout)
     assert told.returncode == 0
-    assert "check   output      DUMMY0, 640 x 480; Broadcast RGB Limited 16:235" in told.stdout
     (output,) = listed["outputs"]
+    refresh = f"{output['state']['refresh_hz']:.4g} Hz"
+    words = f"check   output      DUMMY0, 640 x 480, {refresh}; Broadcast RGB Limited 16:235"
+    assert words in told.stdout
     assert output["state"]["properties"]["Broadcast RGB"] == "Limited 16:235"
     assert 'xrandr --output DUMMY0 --set "Broadcast RGB" "Full"' in output["faults"][0]
 

@@ -165,7 +165,7 @@ class OutputState:
         width, height = self.mode_px
         mode = f"{width} x {height}"
         if self.refresh_hz:
-            mode += f" at {self.refresh_hz:.2f} Hz"
+            mode += f", {self.refresh_hz:.4g} Hz"
         parts = [f"{self.name}, {mode}"]
         for name, value in sorted((self.properties or {}).items()):
             parts.append(f"{name} {_words(value)}")

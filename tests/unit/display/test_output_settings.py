@@ -199,5 +199,5 @@ def test_an_output_s_line_and_fields_have_its_properties():
     assert PLAIN.line() == "DP-1, 1920 x 1080; no properties"
     assert PLAIN.fields()["refresh_hz"] is None
     known = replace(PLAIN, refresh_hz=59.951)
-    assert known.line() == "DP-1, 1920 x 1080 at 59.95 Hz; no properties"
+    assert known.line() == "DP-1, 1920 x 1080, 59.95 Hz; no properties"
     assert known.fields()["refresh_hz"] == 59.951

@@ -43,24 +43,20 @@ def save(line, screen):
 
     A person looks at the screen first: a frame that is still on its way to it is not photographed.
     """
-    standing(screen)
+    standing(screen, 0.04)
     plain_camera.take([str(screen.file), re.search(r"as (\S+\.png) ", line)[1], "--reversed"])
 
 
-def standing(screen):
-    """What is on the screen once it has stood still for a while."""
+def standing(screen, still_s, is_lit=False):
+    """What is on the screen once it has stood still for so long; with `is_lit`, once something is
+    there.
+    """
     for _ in range(500):
         before = screen.pixels()
-        time.sleep(0.04)
-        if (screen.pixels() == before).all():
+        time.sleep(still_s)
+        if (screen.pixels() == before).all() and (before.any() or not is_lit):
             return before
     raise AssertionError("nothing stands still on the screen")
-
-
-def settled(screen):
-    """What is on the screen once something has been there for a while."""
-    wait_for(lambda: standing(screen).any(), "something that stands still on the screen")
-    return standing(screen)
 
 
 def test_a_person_tells_the_mounting_by_a_key_and_saves_the_images(screen, tmp_path):
@@ -86,7 +82,7 @@ def test_a_person_tells_the_mounting_by_a_key_and_saves_the_images(screen, tmp_p
                     "3  the largest square bottom left, the next one to its right, the smallest"
                 )
             )
-            before = settled(screen)
+            before = standing(screen, 0.2, is_lit=True)
             user.press("3")
             told_by(process, "now press")
             wait_for(

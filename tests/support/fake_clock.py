@@ -15,12 +15,16 @@ class FakeClock(HostClock):
 
     def __init__(self, start_ns: int = 1_000_000_000, wakes_late_ns: int = 0) -> None:
         self.ns = start_ns
+        self.held_up_ns = 0
         self.wakes_late_ns = wakes_late_ns
         self.waited_until: list[int] = []
         self.slept_s: list[float] = []
 
     def now_ns(self) -> int:
         return self.ns
+
+    def thread_cpu_ns(self) -> int:
+        return self.ns - self.held_up_ns
 
     def sleep(self, seconds: float) -> None:
         self.slept_s.append(seconds)
@@ -29,6 +33,11 @@ class FakeClock(HostClock):
     def work(self, ns: float) -> None:
         """Let time pass."""
         self.ns += round(ns)
+
+    def hold_up(self, ns: float) -> None:
+        """Let time pass in which other programs have the core."""
+        self.work(ns)
+        self.held_up_ns += round(ns)
 
     def wait_until(self, due_ns: int, stop: threading.Event) -> bool:
         if stop.is_set():

@@ -71,6 +71,10 @@ class HostClock:
         """The time now."""
         return time.monotonic_ns()
 
+    def thread_cpu_ns(self) -> int:
+        """How long this thread has had a core, ns: beside other work less than has passed."""
+        return time.thread_time_ns()
+
     def asleep_ns(self) -> int:
         """How long the machine has slept since it was switched on; CLOCK_MONOTONIC stands still
         meanwhile.

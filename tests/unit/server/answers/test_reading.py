@@ -210,6 +210,19 @@ def test_noise_that_takes_long_to_search_leaves_most_of_the_time_to_others():
     assert sum(each.answer is not None for each in told) == int(np.ceil(left_s / 0.03))
 
 
+def test_no_answer_is_lost_where_other_programs_have_the_core():
+    link = Link([[LINE] * 10], messages=True)
+    decode = link.link._decoder.feed
+
+    def held_up(host_ns: int, data: bytes):
+        link.clock.hold_up(0.3 * NS_PER_S)
+        return decode(host_ns, data)
+
+    link.link._decoder.feed = held_up
+    told = link.take()
+    assert sum(each.answer is not None for each in told) == 10
+
+
 def test_a_tracker_that_is_polled_is_asked_at_its_rate_and_waited_for_no_longer():
     link = Link([[]], poll_hz=20.0, **POLLED)
     for _ in range(8):

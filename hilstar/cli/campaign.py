@@ -2,7 +2,6 @@
 
 import math
 import os
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,7 +16,7 @@ from hilstar.cli import running
 from hilstar.cli.declare import argument, option, struct, switch
 from hilstar.cli.options import json_option, output_option, parse_memory
 from hilstar.cli.running import DisplayOptions, PageOptions
-from hilstar.server.console.terminal import print_found, progress, say
+from hilstar.server.console.terminal import erases_lines, print_found, progress, say
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
@@ -301,7 +300,7 @@ def telling(
     cases: int, clock_s: Callable[[], float] = time.monotonic
 ) -> Iterator[Callable[[int], None]]:
     """Progress with the time left: a bar on a terminal, elsewhere a line every ten seconds."""
-    if sys.stderr is not None and sys.stderr.isatty():
+    if erases_lines():
         with progress("cases", cases) as advance:
             yield advance
         return

@@ -161,10 +161,22 @@ def hand_on(session: pytest.Session) -> None:
 
 
 def report(reporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    """A line for each reason."""
-    reasons = config.stash.get(LEFT_OUT, {})
-    if not reasons:
-        return
-    reporter.section("left out; pytest --all runs these too")
-    for reason, count in sorted(reasons.items(), key=lambda row: -row[1]):
-        reporter.write_line(f"{count:6d} {reason}")
+    """A line for each reason for which tests were left out, and for which a test skipped itself."""
+    left_out = config.stash.get(LEFT_OUT, {})
+    skipped = Counter(
+        reason_to_skip(skip) for skip in reporter.stats.get("skipped", []) if skip.longrepr
+    )
+    for title, reasons in (
+        ("left out; pytest --all runs these too", left_out),
+        ("skipped, by reason", skipped),
+    ):
+        if reasons:
+            reporter.section(title)
+        for reason, count in sorted(reasons.items(), key=lambda row: (-row[1], row[0])):
+            reporter.write_line(f"{count:6d} {reason}")
+
+
+def reason_to_skip(skip: pytest.TestReport) -> str:
+    """What a skipped test said."""
+    _, _, said = skip.longrepr  # type: ignore[misc]
+    return str(said).removeprefix("Skipped: ")

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from hilstar.basics.errors import printable
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
+from hilstar.server.console.terminal import erases_lines
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -229,11 +230,11 @@ def _tracker_line(found: "TrackerFigures") -> StatusLine:
 
 @contextmanager
 def on_terminal(status: RunStatus) -> Iterator[None]:
-    """Show the status on stderr during the `with` block: lines in place on a terminal, else a line
-    every PLAIN_EACH_S.
+    """Show the status on stderr during the `with` block: lines in place on a terminal that can
+    erase them, else a line every PLAIN_EACH_S.
     """
     stop = threading.Event()
-    live = sys.stderr is not None and sys.stderr.isatty()
+    live = erases_lines()
     if live:
         import rich.live  # noqa: F401 - takes 0.1 s, which must not delay a frame later
     thread = threading.Thread(

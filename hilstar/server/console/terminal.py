@@ -44,6 +44,8 @@ STATE_STYLES = {
     "CHANGED": "bold red",
 }
 NAME_STYLE = "bold cyan"  # as options in --help
+# TERM of a terminal that only adds lines; rich draws nothing in place there
+UNABLE_TERMINALS = ("dumb", "unknown")
 BUSY_AFTER_S = 1.0  # a command that ends sooner shows no spinner
 BUSY_THREAD = "hilstar-busy"
 ERASED_WITHIN_S = 0.5
@@ -223,9 +225,11 @@ def clock_line(clock: "ClockSummary") -> str:
     return f"{CLOCK_WORDS[clock.mode]}: {known}{jumps}"
 
 
-def _shows_bars() -> bool:
+def erases_lines() -> bool:
     """Whether stderr is a terminal that can erase a line."""
-    return sys.stderr is not None and sys.stderr.isatty() and os.environ.get("TERM") != "dumb"
+    if sys.stderr is None or not sys.stderr.isatty():
+        return False
+    return os.environ.get("TERM", "").lower() not in UNABLE_TERMINALS
 
 
 @contextmanager
@@ -233,7 +237,7 @@ def progress(what: str, total: float) -> Iterator[Callable[[int], None]]:
     """Show a progress bar on stderr during the `with` block, if stderr is a terminal. Call the
     function that it gives with the number of steps done, of `total` (infinite: not known).
     """
-    if not _shows_bars():
+    if not erases_lines():
         yield lambda done: None
         return
     from rich.console import Console
@@ -266,7 +270,7 @@ def busy(what: str, after_s: float = BUSY_AFTER_S) -> Iterator[None]:
     """Show the elapsed time of a computation of unknown length on stderr during the `with` block,
     once it has taken `after_s`, if stderr is a terminal.
     """
-    if not _shows_bars():
+    if not erases_lines():
         yield
         return
     ended = threading.Event()

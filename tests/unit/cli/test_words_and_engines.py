@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 import math
 import socket
+import sys
 import threading
 from collections.abc import Callable
 from importlib import import_module
@@ -361,9 +362,12 @@ def test_the_costs_of_a_plan_are_those_of_its_sets_and_of_all() -> None:
     assert (told["s"], told["sets"][0]) == (8100.0, rates)
 
 
-def test_progress_without_a_terminal_is_a_line_each_ten_seconds_with_the_time_left(
-    capsys: pytest.CaptureFixture[str],
+@pytest.mark.parametrize("is_terminal", [False, True])
+def test_progress_where_no_line_is_erased_is_a_line_each_ten_seconds_with_the_time_left(
+    is_terminal: bool, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("TERM", "dumb")
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: is_terminal)
     now_s = 1000.0
     with telling(100, lambda: now_s) as line:
         for passed_s, done in ((1.0, 20), (5.0, 30), (11.0, 40), (12.0, 41), (21.0, 60)):

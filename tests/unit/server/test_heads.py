@@ -221,7 +221,7 @@ def test_a_run_of_heads_is_what_each_said_and_a_question_that_came_in_is_answere
     ends = [
         f"{READY} print(len(os.environ['HILSTAR_TOKEN']))",
         f"{READY} print('no JSON'); raise SystemExit(4)",
-        f"{READY} import time, signal; signal.signal(2, lambda *_: (print(3), os._exit(0)));"
+        f"{READY} import time, signal; signal.signal(2, lambda *_: (print(3, flush=True), os._exit(0)));"
         " print('waits', file=__import__('sys').stderr, flush=True); time.sleep(60)",
     ]
     made: list[tuple[object, ...]] = []

@@ -17,6 +17,7 @@ from hilstar.basics.notices import Notices
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.basics.units import NS_PER_S
 from hilstar.basics.wrong_sky import RATES
+from hilstar.server.console import run_status
 from hilstar.server.console.run_status import RunSource, RunStatus, StatusLine, on_terminal
 from hilstar.server.loop import FrameLoop
 from hilstar.server.pacer import Shown
@@ -180,6 +181,7 @@ class Terminal(io.StringIO):
 
 def test_log_lines_stand_above_the_live_lines_and_afterwards_where_they_stood(run, monkeypatch):
     terminal = Terminal()
+    monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setattr(sys, "stderr", terminal)
     handler = logging.StreamHandler(terminal)
     logging.getLogger().addHandler(handler)
@@ -189,3 +191,19 @@ def test_log_lines_stand_above_the_live_lines_and_afterwards_where_they_stood(ru
         assert handler.stream is terminal
     finally:
         logging.getLogger().removeHandler(handler)
+
+
+@pytest.mark.parametrize("term", ["dumb", "unknown", "Dumb"])
+def test_on_a_terminal_that_erases_no_line_a_status_is_a_line_from_time_to_time(
+    run, monkeypatch, term
+):
+    """As in Emacs' shell or on a serial console; rich would draw nothing there."""
+    terminal = Terminal()
+    monkeypatch.setenv("TERM", term)
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setattr(run_status, "PLAIN_EACH_S", 0.001)
+    with on_terminal(run.status):
+        wait_for(lambda: terminal.getvalue().count("\n") > 1, "lines")
+    lines = terminal.getvalue().splitlines()
+    assert all(line.startswith("hilstar: 0 s: ") for line in lines)
+    assert "\x1b" not in terminal.getvalue()

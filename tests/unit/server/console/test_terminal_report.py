@@ -186,6 +186,7 @@ def test_a_status_on_a_terminal_has_a_mark_a_label_and_a_text_a_line(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """It is drawn anew until the run ends, and then gone."""
+    monkeypatch.setenv("TERM", "xterm")
     lines = [StatusLine("frames", "60 Hz"), StatusLine("attitude", "none for 3 s", well=False)]
     screen = io.StringIO()
     monkeypatch.setattr(

@@ -140,7 +140,7 @@ def install(options: InstallOptions) -> None:
         "start it now and whenever you log in: systemctl --user daemon-reload && systemctl --user"
         f" enable --now {service}"
     )
-    say(f"at boot as well, with nobody logged in: loginctl enable-linger {getpass.getuser()}")
+    say(f"at boot as well, with nobody logged in: loginctl enable-linger {user_name()}")
     say(f"to be rid of it: hilstar service uninstall {_bare_name(service)}")
 
 
@@ -270,12 +270,26 @@ def unit_name(name: str) -> str:
 
 
 def units_folder(environment: Mapping[str, str] = os.environ) -> Path:
-    """The folder of this user's systemd units."""
+    """The folder of this user's systemd units. Raises InputError where the user has no home."""
     config = Path(environment.get("XDG_CONFIG_HOME", ""))
     # the standard has a relative path ignored
     if not config.is_absolute():
-        config = Path.home() / ".config"
+        try:
+            config = Path.home() / ".config"
+        except RuntimeError as error:
+            raise InputError(
+                f"user {user_name()} has no home directory for systemd's units: set HOME, or"
+                " XDG_CONFIG_HOME to the folder of settings"
+            ) from error
     return config / "systemd" / "user"
+
+
+def user_name() -> str:
+    """Who this is to the machine: a name, or a number where a container has no name for it."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # OSError from Python 3.13 on
+        return str(os.getuid())
 
 
 def unit_text(

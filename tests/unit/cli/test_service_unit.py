@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import getpass
+import os
+import pwd
 import re
 import shlex
 import shutil
@@ -13,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from hilstar.basics.errors import InputError
-from hilstar.cli.service import unit_name, unit_text, units_folder
+from hilstar.cli.service import unit_name, unit_text, units_folder, user_name
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.waiting import PATIENCE_S
@@ -102,6 +103,21 @@ def test_a_folder_of_settings_that_is_relative_is_none(stated):
     assert absolute == Path("/etc/of mine/systemd/user")
 
 
+def test_a_user_of_a_container_has_a_number_for_a_name_and_may_have_no_home(monkeypatch):
+    """As `docker run --user 1234` has it."""
+    for name in ("LOGNAME", "USER", "LNAME", "USERNAME", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+    assert user_name() == pwd.getpwuid(os.getuid()).pw_name
+
+    def unknown(uid: int):
+        raise KeyError(f"getpwuid(): uid not found: {uid}")
+
+    monkeypatch.setattr(pwd, "getpwuid", unknown)
+    assert user_name() == str(os.getuid())
+    with pytest.raises(InputError, match=r"no home directory .* set HOME"):
+        units_folder({})
+
+
 def test_a_unit_has_the_displays_that_are_named_and_no_others(tmp_path):
     environment = {"DISPLAY": ":1", "XAUTHORITY": "", "WAYLAND_DISPLAY": "wayland $1", "HOME": "/"}
     text = unit_text(tmp_path / "u", tmp_path / "b.toml", [], environment=environment)
@@ -186,7 +202,7 @@ def test_where_users_have_no_namespace_the_unit_asks_for_none(service_bench, mon
 def test_what_was_installed_can_be_uninstalled(service_bench, name, monkeypatch):
     units = service_bench.parent / "config" / "systemd" / "user"
     done = install(service_bench, "--", "--console", "0.0.0.0:8765")
-    assert f"loginctl enable-linger {getpass.getuser()}" in done.stderr
+    assert f"loginctl enable-linger {user_name()}" in done.stderr
     (units / "mine.service").write_text("kept")
     asked = service_bench.parent / "asked.txt"
     (service_bench.parent / "systemctl").write_text(f"#!/bin/sh\necho $* >> '{asked}'\n")

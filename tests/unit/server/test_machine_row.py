@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import getpass
 import json
 import re
 import socket
 from pathlib import Path
 
+from hilstar.cli.service import user_name
 from hilstar.server.doctor import COLUMNS, row, table
 from tests.support.commands import run_hilstar_here
 
@@ -63,7 +63,7 @@ def test_the_row_names_parts_and_versions_and_nothing_private(monkeypatch):
         "labs-bench-ada",
         "/dev/",
     } - {"localhost", "/", ""}
-    private |= {getpass.getuser()} - {"root"}
+    private |= {user_name()} - {"root"}
     assert not [words for words in private if re.search(rf"(?<!\w){re.escape(words)}(?!\w)", text)]
 
 

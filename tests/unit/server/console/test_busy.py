@@ -29,6 +29,7 @@ def on_terminal(monkeypatch):
 
     def begun():
         monkeypatch.setenv("TERM", "xterm")
+        monkeypatch.setenv("COLUMNS", "80")
         stream = Terminal()
         monkeypatch.setattr(sys, "stderr", stream)
         return stream

@@ -188,6 +188,7 @@ minimum = 0.9
 
 
 @pytest.mark.e2e
+@pytest.mark.usefixtures("without_charts")
 @pytest.mark.parametrize("clock", ["host", "own"])
 def test_a_real_tracker_s_rates_and_stamps_are_judged_over_udp(tmp_path: Path, clock: str) -> None:
     """A stub in a process of its own: stamps late by 0.1 s, rates off by 0.03 deg/s about y. Its
@@ -288,6 +289,7 @@ SHARE, TO_SIGMA = 0.1, 3 / 1.645
 
 
 @pytest.mark.e2e
+@pytest.mark.usefixtures("without_charts")
 def test_planted_faults_of_single_stars_are_found_over_udp(tmp_path: Path) -> None:
     """The stub's field is what the display shows, a third of its detector: stars beside that were
     not lit, and count for nothing.

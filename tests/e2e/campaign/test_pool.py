@@ -53,6 +53,7 @@ def runs(pid: int) -> bool:
         return False
 
 
+@pytest.mark.usefixtures("without_charts")
 def test_the_table_is_the_same_after_every_kind_of_end_and_with_cases_that_fail(
     pool_folder: Path,
 ) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import base64
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 from unittest import mock
 
 if TYPE_CHECKING:
@@ -24,27 +24,24 @@ PNG = base64.b64decode(
 
 
 def charts_left_out() -> mock._patch[Any]:
-    """A context within which no chart is laid out, and each picture of one is empty; `start`
-    begins it for good.
-    """
-    return mock.patch.multiple(CHARTS, finish=lay_nothing_out, svg=empty_svg, png=empty_png)
+    """A context within which each chart is empty as it is finished; `start` begins it for good."""
+    return mock.patch(f"{CHARTS}.finish", leave_empty)
 
 
 def are_charts_left_out() -> bool:
     """Whether this process draws none now."""
     charts = sys.modules.get(CHARTS)
-    return getattr(charts, "finish", None) is lay_nothing_out
+    return getattr(charts, "finish", None) is leave_empty
 
 
-def lay_nothing_out(figure: Figure) -> None:
-    """In the place of `charts.finish`."""
+def leave_empty(figure: Figure) -> None:
+    """In the place of `charts.finish`: no layout, and a picture of nothing whoever asks for it."""
+    vars(figure)["savefig"] = save_nothing
 
 
-def empty_svg(figure: Figure) -> str:
-    """In the place of `charts.svg`."""
-    return SVG
-
-
-def empty_png(figure: Figure) -> bytes:
-    """In the place of `charts.png`."""
-    return PNG
+def save_nothing(file: IO[Any], *, format: str, **_: object) -> None:
+    """In the place of a figure's `savefig`."""
+    if format == "svg":
+        file.write(SVG)
+    else:
+        file.write(PNG)

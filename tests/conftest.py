@@ -34,6 +34,7 @@ import hilstar
 from hilstar.instruments.study.sweep import OtherWork
 from tests.support import leftovers, selection
 from tests.support.benches import SMALL_BENCH
+from tests.support.undrawn import charts_left_out
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -192,14 +193,12 @@ def rng() -> np.random.Generator:
 
 
 @pytest.fixture
-def without_charts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Charts are neither laid out nor drawn, which takes a third of a calibration's time: for
-    tests that look at none.
+def without_charts() -> Iterator[None]:
+    """Charts are neither laid out nor drawn: for tests that look at none. A fixture of a module
+    uses `charts_left_out`.
     """
-    from hilstar.basics import charts
-
-    monkeypatch.setattr(charts, "finish", lambda figure: None)
-    monkeypatch.setattr(charts, "svg", lambda figure: "<svg></svg>")
+    with charts_left_out():
+        yield
 
 
 @pytest.fixture

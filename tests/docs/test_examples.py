@@ -67,6 +67,7 @@ def folder(tmp_path, monkeypatch) -> Path:
 
 
 @pytest.mark.e2e
+@pytest.mark.usefixtures("without_charts")
 @pytest.mark.parametrize("page", EXAMPLES, ids=[str(page.relative_to(ROOT)) for page in EXAMPLES])
 def test_the_examples_do_what_the_page_says(page, folder, ports):
     names: dict[str, Any] = {"__name__": "__main__"}

@@ -61,6 +61,7 @@ needs_aravis = pytest.mark.skipif(
 
 
 @needs_aravis
+@pytest.mark.usefixtures("without_charts")
 def test_first_light_calibrates_a_bench_through_the_virtual_trackers_camera(screen_here, tmp_path):
     bench, truth = benches(tmp_path)
     endpoint = f"tcp://127.0.0.1:{free_port()}"
@@ -88,6 +89,7 @@ def test_first_light_calibrates_a_bench_through_the_virtual_trackers_camera(scre
 
 
 @needs_aravis
+@pytest.mark.usefixtures("without_charts")
 def test_geometry_and_psf_are_calibrated_by_dots_that_a_camera_takes(screen_here, tmp_path):
     bench, truth = benches(tmp_path)
     endpoint = f"tcp://127.0.0.1:{free_port()}"

@@ -33,6 +33,7 @@ from unittest import mock
 
 from hilstar.basics.process.interrupts import leave
 from tests.support.benches import LIVE_BENCH, SCREEN_BENCH, SMALL_BENCH
+from tests.support.undrawn import are_charts_left_out, charts_left_out
 
 HILSTAR = [sys.executable, "-m", "hilstar"]
 # What a bench imports before its first frame, and the commands that tests start most; no window, no
@@ -124,6 +125,7 @@ class Started(subprocess.Popen):
             "environment": environment,
             "inherited": inherited_settings(),
             "ignored": self._ignored,
+            "draws_no_charts": are_charts_left_out(),
         }
         streams = [
             own if own >= 0 else number for number, own in enumerate((p2cread, c2pwrite, errwrite))
@@ -268,6 +270,8 @@ def become_command(request: dict[str, Any], streams: list[int], told: int) -> No
     _, option, what, *words = request["words"]
     sys.path[0] = request["folder"] if option == "-m" else ""
     sys.argv = [what if option == "-m" else "-c", *words]
+    if request["draws_no_charts"]:
+        charts_left_out().start()
     show_command_line(request["words"])
     os.write(told, str(os.getpid()).encode())
     os.close(told)

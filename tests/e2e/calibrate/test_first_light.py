@@ -16,7 +16,6 @@ import time
 import numpy as np
 import pytest
 
-from hilstar.basics import charts
 from hilstar.basics.resources import resource_path
 from hilstar.basics.rotation import from_rotation_vector, to_matrix
 from hilstar.basics.units import ARCSEC_PER_RAD
@@ -38,6 +37,7 @@ from tests.support.benches import TWIN, bench_text
 from tests.support.claims import holds
 from tests.support.commands import assert_refused, run_hilstar_here, typed
 from tests.support.forks import HILSTAR, Started
+from tests.support.undrawn import charts_left_out
 from tests.support.waiting import PATIENCE_S
 
 GAMMA_22 = {"monitor": {"calibration": "gamma2.2", "photodiode_px": 40}}
@@ -130,13 +130,14 @@ def steps_by_name(result):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
+    """A session before and after its response was measured; tests/e2e/browser looks at a page with
+    its charts.
+    """
     folder = plant(tmp_path_factory.mktemp("light"), flip_x=True)
-    with pytest.MonkeyPatch.context() as patched:  # of this page nothing is looked at
-        patched.setattr(charts, "finish", lambda figure: None)
-        patched.setattr(charts, "svg", lambda figure: "<svg></svg>")
+    with charts_left_out():
         before = virtually(folder, *NONE)
+        result = virtually(folder, *FEW)
     assert before.returncode == 1, before.stderr
-    result = virtually(folder, *FEW)
     assert result.returncode == 0, result.stderr
     return folder, json.loads(result.stdout), steps_by_name(before)
 

@@ -28,7 +28,7 @@ from tests.support.forks import HILSTAR, Started
 from tests.support.senders import free_port
 from tests.support.waiting import PATIENCE_S, wait_for
 
-pytestmark = pytest.mark.e2e
+pytestmark = [pytest.mark.e2e, pytest.mark.usefixtures("without_charts")]
 FIELD = {"kind": "field", "radec_deg": [80.0, 20.0], "radius_deg": 1.5, "roll_deg": [0.0, 0.0]}
 CASES, CHECK_EVERY = 200, 40
 # The rms of 400 values, two axes a case, has a sigma of 3.5 %, and that of 200 one of 5 %: 3.5 sigmas.

@@ -23,6 +23,7 @@ from tests.support.benches import ROOT
 from tests.support.campaigns import read_columns, rows_so_far, write_campaign
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here, run_started
 from tests.support.forks import Started
+from tests.support.undrawn import charts_left_out
 from tests.support.waiting import PATIENCE_S, wait_for
 
 DASK = [sys.executable, "-m", "dask"]
@@ -49,6 +50,8 @@ with distributed.Client(sys.argv[1]) as client:
 """
 WORKER = ("--nthreads", "1", "--no-nanny", "--no-dashboard", "--death-timeout", "60")
 OPTIONS = ("--solver", "python:sleepy:solve", "--json")
+
+pytestmark = pytest.mark.usefixtures("without_charts")
 
 
 @contextlib.contextmanager
@@ -104,9 +107,10 @@ def pool_table(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     folder = tmp_path_factory.mktemp("pool")
     write_campaign(folder, cases=24)
     (folder / "sleepy.py").write_text(SOLVER)
-    result = run_hilstar_here(
-        "campaign", "plan.toml", "-o", "pool", "--workers", "1", *OPTIONS, cwd=folder
-    )
+    with charts_left_out():
+        result = run_hilstar_here(
+            "campaign", "plan.toml", "-o", "pool", "--workers", "1", *OPTIONS, cwd=folder
+        )
     assert result.returncode == 0, result.stderr
     return (folder / "pool/cases.parquet").read_bytes()
 

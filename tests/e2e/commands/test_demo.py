@@ -135,6 +135,7 @@ def test_the_demo_can_be_watched_and_acted_on(tmp_path):
             process.communicate()
 
 
+@pytest.mark.usefixtures("without_charts")
 def test_with_a_tracker_the_loop_is_closed_and_its_budget_stands_beside_what_was_planted(tmp_path):
     """Six seconds: the bias, with what the field-of-view error adds to it over so short a scan,
     and the live figures.

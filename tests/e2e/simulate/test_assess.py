@@ -15,6 +15,7 @@ from tests.support.planted_tracker import Sizes, plant, scan
 
 
 @pytest.mark.e2e
+@pytest.mark.usefixtures("without_charts")
 def test_a_replayed_log_and_its_trackers_answers_give_the_budget(tmp_path: Path) -> None:
     planted = plant(scan, Sizes(fov=0.0, wild=3), np.random.default_rng(21), seconds=30.0)
     log, bench, ledger = tmp_path / "log.csv", tmp_path / "bench.toml", tmp_path / "run.mcap"

@@ -71,6 +71,7 @@ class FlightSoftware:
         return self._solve(FoundStars(x_px, y_px, stars.flux[inside], rays), image)
 
 
+@pytest.mark.usefixtures("without_charts")
 def test_flight_software_before_the_camera_is_assessed(tmp_path):
     bench, endpoint = tmp_path / "bench.toml", f"tcp://127.0.0.1:{free_port()}"
     bench.write_text(

@@ -25,7 +25,7 @@ from tests.support.stub_tracker import Stub
 from tests.support.waiting import wait_for
 from tests.support.wire.ptys import serial_line
 
-pytestmark = pytest.mark.e2e
+pytestmark = [pytest.mark.e2e, pytest.mark.usefixtures("without_charts")]
 SHOWN_WITHIN_S = 0.2
 ANSWERS = 45  # `assess` wants 30, and a busy machine holds some up
 STUB = {"wild": 0.06, "swing_deg": 1.0, "seed": 4}

@@ -14,6 +14,7 @@ from hilstar.instruments.calibrate.first_light.stars import draw_light, draw_res
 from hilstar.instruments.calibrate.first_light.uniformity import _draw_warm_up
 from hilstar.instruments.calibrate.warm_up import judge_warm_up
 from tests.support.card_texts import drawn_figures
+from tests.support.figures import assert_legible
 
 PATH = Path("chart")  # which nothing is written to
 
@@ -37,6 +38,12 @@ def test_a_monitor_of_a_steeper_response_is_drawn_as_fainter_than_in_the_bench_f
     assert axes.yaxis_inverted() and axes.get_xscale() == "log"
     assert axes.get_ylabel() == "fainter than in the bench file [mag]"
     assert title_of(drawn[0]).endswith("is off by 0.250 mag rms, 0.625 max")
+
+
+def test_a_response_that_is_off_is_drawn_legibly(figures):
+    responses = gamma_response(8, 2.2), gamma_response(8, 2.4)
+    _draw_before(PATH, {"bench_file_off_rms_mag": 0.25, "bench_file_off_max_mag": 0.625}, responses)
+    assert_legible(figures[0])
 
 
 def test_a_star_that_is_too_faint_is_drawn_down_at_its_light_and_at_its_place():

@@ -96,6 +96,7 @@ def test_a_planted_budget_and_what_a_parameter_costs_are_found(cases_table: Path
         assert picture.width > 500 and len(picture.convert("L").getcolors() or range(300)) > 10
 
 
+@pytest.mark.usefixtures("without_charts")
 def test_the_page_has_the_verdict_and_the_cost_of_each_parameter(cases_table: Path) -> None:
     write_results(
         cases_table, read_bench_file(write_campaign(cases_table.parent).parent / "bench.toml"), 1

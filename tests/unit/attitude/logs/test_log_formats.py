@@ -157,6 +157,26 @@ def test_a_pyproject_of_another_project_beside_the_package_is_not_taken(tmp_path
     assert formats._of_checkout(path) == []
 
 
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("CCSDS_AEM_VERS = 1.0\n", "CCSDS_AEM_VERS"),
+        ("\n  \nCIC_AEM_VERS = 1.0\n", "CIC_AEM_VERS"),
+        ("COMMENT of the mission\nCCSDS_AEM_VERS = 1.0\n", "CCSDS_AEM_VERS"),
+        ("COMMENT\nCOMMENT two\nCIC_AEM_VERS = 1.0\n", "CIC_AEM_VERS"),
+        ("# by STK\n#\nstk.v.11.0\n", "stk.v.11.0"),
+        ("// of a run\n{}\n", "{}"),
+        ("COMMENTS = 1\n", "COMMENTS"),
+        ("# alone\nCOMMENT\n", ""),
+        ("", ""),
+    ],
+)
+def test_a_file_is_what_its_first_word_after_comments_says(tmp_path, text, word):
+    path = tmp_path / "a.txt"
+    path.write_text(text)
+    assert formats.LogHead(path, b"").word == word
+
+
 def test_reading_names_no_format_of_a_log_itself():
     own = {magic for each in formats.log_formats() for magic in each.magic}
     assert own and own.isdisjoint(reading.MAGIC)

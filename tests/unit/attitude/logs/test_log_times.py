@@ -207,6 +207,21 @@ def test_rates_about_another_axis_say_nothing_of_the_times(inclined_deg, is_name
     assert bool(time_notices(samples, "s")) is is_named
 
 
+def test_a_turn_across_a_jump_says_nothing_of_the_times_and_one_after_it_does():
+    """A log of pairs 20 ms apart, its times in ms: before each pair it jumps about x."""
+    axis = np.array([0.0, 0.0, 1.0])
+    samples = []
+    for k in range(20):
+        turned = Rotation.from_rotvec(-0.002 * axis * (k % 2)) * Rotation.from_rotvec(
+            [k // 2, 0, 0]
+        )
+        q = turned.as_quat(scalar_first=True)
+        jumps = k % 2 == 0
+        samples.append(AttitudeSample(k * 20 * 10**9, q, 0.1 * axis, k, discontinuity=jumps))
+    ((_, said),) = time_notices(samples, "s")
+    assert "the times are in ms" in said
+
+
 def test_the_ratio_of_rates_and_turns_is_that_of_most_intervals():
     """One rate of twenty is a hundred times as long as the others."""
     turned = np.tile([0.01, 0.0, 0.0], (20, 1))

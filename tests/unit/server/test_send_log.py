@@ -190,3 +190,37 @@ def test_a_stopped_sender_sends_no_more(rng):
     stop.set()
     send(BadCable(Faults(), rng, left.append), spin_samples(RATE, 100.0, (0.0, 0.0, 0.0)), stop)
     assert left == []
+
+
+@pytest.mark.parametrize(("sent", "sequences"), [(4, [1, 0, 3, 2]), (5, [1, 0, 3, 2, 4])])
+def test_a_sender_ends_with_the_packet_that_its_cable_holds_back(rng, sent, sequences):
+    left: list[bytes] = []
+    cable = BadCable(Faults(reorder=1.0), rng, left.append)
+    samples = itertools.islice(spin_samples(RATE, 1e6, (0.0, 0.0, 0.0)), sent)
+    send(cable, samples, threading.Event())
+    assert [decode(data).sequence for data in left] == sequences
+    assert cable.tally.total == sent
+
+
+def test_a_sender_that_is_stopped_lets_out_what_its_cable_holds_back(rng):
+    left: list[bytes] = []
+    stop = threading.Event()
+    cable = BadCable(Faults(reorder=1.0), rng, left.append)
+    samples = spin_samples(RATE, 1e6, (0.0, 0.0, 0.0))
+    send(cable, samples, stop, on_sent=lambda count: stop.set())
+    assert [decode(data).sequence for data in left] == [0]
+
+
+def test_a_packet_has_all_of_its_sample_but_the_time(rng):
+    left: list[bytes] = []
+    rate = np.array([0.25, 0.5, -0.125])  # of float32, as a packet has it
+    samples = [AttitudeSample(0, START, rate, 7), AttitudeSample(1, START, None, 8, True)]
+    send(BadCable(Faults(), rng, left.append), iter(samples), threading.Event())
+    first, last = map(decode, left)
+    assert first.q_icrs_to_cam.tolist() == START.tolist()
+    assert np.array_equal(first.rate_cam_rad_s, rate) and last.rate_cam_rad_s is None
+    assert [(each.sequence, each.discontinuity) for each in (first, last)] == [
+        (7, False),
+        (8, True),
+    ]
+    assert last.t_ns - first.t_ns == 1

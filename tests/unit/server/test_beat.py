@@ -238,6 +238,11 @@ def test_a_panel_that_flashes_wants_a_trigger(tmp_path):
     )
     assert found.matters and found.proposal.exposure_s is found.proposal.refresh_hz is None
     assert found.proposal.frame_hz == pytest.approx(7.5)
+    # one of seven has room in seven, though 0.07 times 100 is 7.000000000000001
+    tracker = {"exposure_s": 0.07, "frame_hz": 13.9}
+    monitor = {"hold_ms": 1, "refresh_hz": 100}
+    whole = beat_of(beating_config(tmp_path, tracker, monitor=monitor))
+    assert whole.proposal.frame_hz == pytest.approx(100 / 7)
     # an exposure of 2.3 refreshes has no room in two
     tracker = {"exposure_s": 2.3 / 60, "frame_hz": 25.0}
     long = beat_of(beating_config(tmp_path, tracker, monitor={"hold_ms": 1}))

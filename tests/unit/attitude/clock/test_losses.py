@@ -158,6 +158,25 @@ def test_a_unit_goes_by_paces_in_a_row_and_not_by_their_number(paces, named):
     assert bool(notices.lasting.get(UNIT)) is bool(named)
 
 
+@pytest.mark.parametrize(("packets", "named"), [(5, ""), (6, "microseconds")])
+def test_a_unit_is_told_by_five_intervals(packets, named):
+    unit = TimeUnit(Notices())
+    for k in range(packets):
+        unit.see(k * 200_000, k * NS_PER_S // 5)
+    assert unit.named == named
+
+
+@pytest.mark.parametrize("pause_s", [0.2, 20.0, 200.0])
+def test_a_pause_in_which_a_simulation_stands_is_of_no_unit(pause_s):
+    """0.2 s of it are a thousandth of 200 s."""
+    notices = Notices()
+    unit = TimeUnit(notices)
+    for k in range(200):
+        waited_s = pause_s * (k // 20)
+        unit.see(k * NS_PER_S // 100, k * NS_PER_S // 100 + round(waited_s * NS_PER_S))
+    assert not unit.named and UNIT not in notices.counts()
+
+
 def test_picoseconds_have_no_whole_factor():
     notices = Notices()
     unit = TimeUnit(notices)

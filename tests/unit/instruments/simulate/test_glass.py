@@ -285,6 +285,30 @@ def test_a_told_glass_is_what_is_drawn_about_a_pixel_at_each_star_s_place(glass_
         assert square.sum() > 0.9
 
 
+@pytest.mark.parametrize(
+    ("resolution_px", "moved_px", "beyond_px"),
+    [
+        ((SIDE_PX + 44, SIDE_PX), (0, 20), 48),  # a corner: the hypotenuse of 44 and 20
+        ((SIDE_PX + 44, SIDE_PX), (30, 0), 30),  # on the left; 14 are left on the right
+        ((SIDE_PX, SIDE_PX + 44), (0, 30), 30),
+        ((SIDE_PX, SIDE_PX + 44), (20, 0), 48),
+    ],
+)
+def test_how_far_a_detector_reaches_beyond_the_points_is_told_of_its_farthest_corner(
+    glass_file, caplog, resolution_px, moved_px, beyond_px
+):
+    """Points from corner to corner of a square, which the lens moves by its decentre."""
+    right_um, down_um = (10.0 * px for px in moved_px)
+    tracker = glass_file(
+        {
+            "tracker": {"resolution_px": resolution_px, "pixel_pitch_um": 10.0},
+            "tracker.optics": {"decentre_x_um": right_um, "decentre_y_um": down_um},
+        }
+    )
+    tracker_psf(tracker.config.tracker, tracker.folder)
+    assert f"reaches {beyond_px} px beyond the file's points" in caplog.text
+
+
 def test_what_the_file_does_not_cover_is_said(glass_file, caplog):
     wide = glass_file(
         {"tracker": {"resolution_px": [300, SIDE_PX]}, "tracker.optics": {"focus_um": 7.0}}

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from hilstar.server.bench.config.sky import SiteSettings
-from hilstar.server.bench.site import site_extinction
+from hilstar.server.bench.site import site_extinction, site_refraction
+from hilstar.sky.electrons import Optics
+from hilstar.sky.spectrum import Curve, constant_curve
 from tests.support.refusals import refusal
 
 NM = np.array([450.0, 550.0])
@@ -36,3 +38,16 @@ def test_an_extinction_is_a_number_a_place_s_or_a_file_s(tmp_path):
 def test_what_is_no_extinction_is_refused(tmp_path, extinction, words):
     (tmp_path / "thick.csv").write_text("wavelength_nm,value\n400,10.5\n600,0.2\n")
     assert words in refusal(site_extinction, site(extinction), tmp_path)
+
+
+def test_refraction_is_that_of_the_site_s_pressure_temperature_and_humidity():
+    """ERFA's own test of eraRefco: 800 hPa, 10 C, 90 %, 0.4 um."""
+    line = Curve(np.array([399.9, 400.1]), np.ones(2))
+    optics = Optics(30.0, line, constant_curve(1.0))
+    air = SiteSettings(
+        latitude_deg=0, longitude_deg=0, pressure_hpa=800.0, temperature_c=10.0, humidity=0.9
+    )
+    a, b = site_refraction(air, optics)
+    # the dispersion of 0.1 nm at 400 nm is under 1e-5 of it
+    assert a == pytest.approx(0.2264949956241415e-3, rel=1e-5)
+    assert b == pytest.approx(-0.2598658261729344e-6, rel=1e-5)

@@ -126,6 +126,13 @@ def test_a_rate_between_two_of_a_log_is_between_theirs_and_none_crosses_a_break(
     assert [k for k, sample in enumerate(samples) if sample.discontinuity] == [6]
 
 
+def test_a_jump_between_two_packets_of_a_resampled_log_is_one_at_the_second():
+    """A log of 100 Hz, sent at 10 Hz: nine more of its samples lie between two packets."""
+    times_s = [k / 100 for k in range(41)]
+    samples = list(log_samples(turning(times_s, [None] * 41, breaks={12}), 10.0))
+    assert [k for k, sample in enumerate(samples) if sample.discontinuity] == [2]
+
+
 def test_behind_a_gap_a_log_begins_anew_and_no_rate_crosses_it():
     times_s = [0.0, 1.0, 2.0, 3.0, 60.0, 61.0, 62.0, 63.0]
     samples = list(log_samples(turning(times_s, [None] * len(times_s)), None))

@@ -110,6 +110,24 @@ def test_a_format_of_another_package_is_read_written_and_named(tmp_path, package
         write_log(tmp_path / "c.txt", samples)
 
 
+@pytest.mark.parametrize("name", ["a.CSV", "b.Jsonl", "c.json", "d.MCAP"])
+def test_a_log_is_written_by_the_ending_of_its_name_in_capitals_or_not(tmp_path, name):
+    (tmp_path / "log.csv").write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n1,0,1,0,0\n")
+    samples = read_log(tmp_path / "log.csv")
+    write_log(tmp_path / name, samples)
+    assert [sample.t_ns for sample in read_log(tmp_path / name)] == [0, 10**9]
+
+
+def test_a_file_with_the_magic_number_of_two_formats_is_what_any_such_file_is():
+    """A ledger is an MCAP file of a run: by its first bytes alone it is an MCAP file."""
+    ledger, mcap = (
+        next(form for form in formats.log_formats() if form.name == name)
+        for name in ("the ledger of a run", "an MCAP file")
+    )
+    assert ledger.magic == mcap.magic
+    assert {formats.kinds()[magic] for magic in mcap.magic} == {"an MCAP file"}
+
+
 def test_a_format_of_hilstar_s_is_tried_before_another_that_looks_as_close(package):
     """Both have a magic number and nothing else to look at: which comes first is hilstar's."""
     package("planetarium_log:FORMAT")

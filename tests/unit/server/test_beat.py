@@ -230,6 +230,9 @@ def test_a_display_s_own_modes_are_what_is_proposed(tmp_path):
     # the nearest, neither the slowest nor the fastest
     config = beating_config(tmp_path, {"exposure_s": 0.125})  # 7.5 refreshes
     assert beat_of(config, modes_hz=(96, 48, 64)).proposal.refresh_hz == 64
+    # twice the rate is no farther off than that
+    assert beat_of(config, modes_hz=(120,)).proposal.refresh_hz == 120
+    assert beat_of(config, modes_hz=(128,)).proposal.refresh_hz is None
 
 
 def test_a_panel_that_flashes_wants_a_trigger(tmp_path):

@@ -231,19 +231,20 @@ class CsvLog:
         """
         t_ns = ns_of_seconds(cells[self._t.place])
         w, x, y, z = (cells[column.place] for column in self._q)
-        # float() would read 1_0 as 10
-        if "_" in w + x + y + z:
-            raise ValueError
+        refuse_grouped(w + x + y + z)
         q = float(w), float(x), float(y), float(z)
         rate = None
         if self._rates:
             turning = [cells[column.place].strip() for column in self._rates]
             if any(turning):
+                refuse_grouped("".join(turning))
                 rate = float(turning[0]), float(turning[1]), float(turning[2])
         sequence = 0
         discontinuity = False
         if self._sequence is not None:
-            sequence = int(cells[self._sequence.place].strip() or 0)
+            text = cells[self._sequence.place].strip()
+            refuse_grouped(text)
+            sequence = int(text or 0)
             if sequence not in WHOLE_NUMBERS:
                 raise ValueError
         if self._discontinuity is not None:
@@ -252,6 +253,12 @@ class CsvLog:
             text = cells[self._t.place].strip()[:MAX_QUOTED_CHARACTERS]
             return Refusal("format", f"t_s = {text} s does not fit 64 bits of ns; {UNITS_ADVICE}")
         return checked_sample(t_ns, q, rate, sequence, discontinuity)
+
+
+def refuse_grouped(digits: str) -> None:
+    """Raise ValueError for numbers such as 1_0, which Python alone reads, as 10."""
+    if "_" in digits:
+        raise ValueError
 
 
 def rates_of_others(table: TextTable) -> str:

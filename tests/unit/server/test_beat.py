@@ -230,6 +230,9 @@ def test_a_display_s_own_modes_are_what_is_proposed(tmp_path):
     # the nearest, neither the slowest nor the fastest
     config = beating_config(tmp_path, {"exposure_s": 0.125})  # 7.5 refreshes
     assert beat_of(config, modes_hz=(96, 48, 64)).proposal.refresh_hz == 64
+    # twice the rate is no farther off than that
+    assert beat_of(config, modes_hz=(120,)).proposal.refresh_hz == 120
+    assert beat_of(config, modes_hz=(128,)).proposal.refresh_hz is None
 
 
 def test_a_panel_that_flashes_wants_a_trigger(tmp_path):
@@ -238,6 +241,11 @@ def test_a_panel_that_flashes_wants_a_trigger(tmp_path):
     )
     assert found.matters and found.proposal.exposure_s is found.proposal.refresh_hz is None
     assert found.proposal.frame_hz == pytest.approx(7.5)
+    # one of seven has room in seven, though 0.07 times 100 is 7.000000000000001
+    tracker = {"exposure_s": 0.07, "frame_hz": 13.9}
+    monitor = {"hold_ms": 1, "refresh_hz": 100}
+    whole = beat_of(beating_config(tmp_path, tracker, monitor=monitor))
+    assert whole.proposal.frame_hz == pytest.approx(100 / 7)
     # an exposure of 2.3 refreshes has no room in two
     tracker = {"exposure_s": 2.3 / 60, "frame_hz": 25.0}
     long = beat_of(beating_config(tmp_path, tracker, monitor={"hold_ms": 1}))

@@ -11,6 +11,7 @@ from PIL import Image
 from hilstar.basics.rotation import (
     angle_between_rad,
     from_radec_roll_deg,
+    propagate,
     slerp,
     to_radec_roll_deg,
 )
@@ -64,6 +65,16 @@ def test_a_scan_is_to_and_fro_about_its_place(rng):
         ra_deg, dec_deg, roll_deg = to_radec_roll_deg(samples[round(t_s * 100)].q_icrs_to_cam)
         assert (ra_deg, dec_deg) == pytest.approx(turns[:2], abs=1e-6)
         assert (roll_deg - turns[2] + 180) % 360 - 180 == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.usefixtures("still")
+def test_each_rate_is_that_of_the_turn_from_the_first_sample_to_the_last(rng):
+    rate = np.array([0.02, -0.05, 0.3])
+    begin = np.array(from_radec_roll_deg(10.0, 20.0, 30.0))
+    samples = _jittered(lambda t_s: propagate(begin, rate, t_s), 1.0, rng)
+    rates = np.array([sample.rate_cam_rad_s for sample in samples])
+    assert rates == pytest.approx(np.tile(rate, (len(samples), 1)), abs=1e-9)
+    assert [sample.sequence for sample in samples] == list(range(len(samples)))
 
 
 def test_jitter_is_as_large_as_stated_about_each_axis_and_forgets_in_its_time(rng):

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import sys
 import threading
 import time
@@ -74,6 +75,41 @@ def test_a_head_that_ends_in_no_order_is_begun_again(tmp_path, first, restarts, 
     assert ended(head) == (0, restarts)
     assert head.output == b"7\n"
     assert said in lines[0]
+
+
+def says_ready(life: Path) -> None:
+    """What a head's process says once it draws."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as head:
+        head.sendto(b"READY=1", str(life))
+
+
+def test_what_a_head_s_last_process_said_is_not_the_next_one_s(tmp_path, monkeypatch):
+    """One that is ready is stalled at once here; one that begins has its time."""
+    monkeypatch.setattr(heads, "STALLED_S", -1.0)
+    lines: list[str] = []
+    life = tmp_path / "life"
+    codes = (
+        "import os; os.kill(os.getpid(), 9)",
+        "import time; time.sleep(0.1); raise SystemExit(3)",
+    )
+    head = HeadProcess("head", lambda number, drawn_s: python(codes[number]), lines.append, life)
+    wait_for(lambda: head.tend() and lines, "its process has ended", poll_s=0.01)
+    says_ready(life)
+    assert ended(head) == (3, 1)
+
+
+def test_a_head_has_drawn_since_its_first_process_was_ready(tmp_path):
+    life = tmp_path / "life"
+    waits = python("import time; time.sleep(60)")
+    head = HeadProcess("head", lambda number, drawn_s: waits, print, life)
+    try:
+        assert head.tend() and head.drawn_s == 0.0
+        says_ready(life)
+        wait_for(lambda: head.tend() and head.drawn_s > 0.02, "20 ms have passed", poll_s=0.01)
+        says_ready(life)
+        assert head.tend() and head.drawn_s > 0.02
+    finally:
+        head.close(0.0)
 
 
 @pytest.mark.parametrize(
@@ -271,8 +307,10 @@ def test_a_run_of_heads_is_what_each_said_and_a_question_that_came_in_is_answere
 
 
 def test_the_common_source_gives_the_body_s_attitude(tmp_path):
-    file = read_heads(heads_file(tmp_path, 5599))
+    """Whatever the mounting of the first head."""
+    file = read_heads(heads_file(tmp_path, 5599, names="bc"))
     config = heads.source_config(file)
+    assert file.files[0].config.tracker.q_body_to_cam != (1.0, 0.0, 0.0, 0.0)
     assert config.tracker.q_body_to_cam == (1.0, 0.0, 0.0, 0.0)
     assert config.attitude == file.files[0].config.attitude
 

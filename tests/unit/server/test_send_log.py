@@ -126,6 +126,13 @@ def test_a_rate_between_two_of_a_log_is_between_theirs_and_none_crosses_a_break(
     assert [k for k, sample in enumerate(samples) if sample.discontinuity] == [6]
 
 
+def test_a_jump_between_two_packets_of_a_resampled_log_is_one_at_the_second():
+    """A log of 100 Hz, sent at 10 Hz: nine more of its samples lie between two packets."""
+    times_s = [k / 100 for k in range(41)]
+    samples = list(log_samples(turning(times_s, [None] * 41, breaks={12}), 10.0))
+    assert [k for k, sample in enumerate(samples) if sample.discontinuity] == [2]
+
+
 def test_behind_a_gap_a_log_begins_anew_and_no_rate_crosses_it():
     times_s = [0.0, 1.0, 2.0, 3.0, 60.0, 61.0, 62.0, 63.0]
     samples = list(log_samples(turning(times_s, [None] * len(times_s)), None))
@@ -190,3 +197,37 @@ def test_a_stopped_sender_sends_no_more(rng):
     stop.set()
     send(BadCable(Faults(), rng, left.append), spin_samples(RATE, 100.0, (0.0, 0.0, 0.0)), stop)
     assert left == []
+
+
+@pytest.mark.parametrize(("sent", "sequences"), [(4, [1, 0, 3, 2]), (5, [1, 0, 3, 2, 4])])
+def test_a_sender_ends_with_the_packet_that_its_cable_holds_back(rng, sent, sequences):
+    left: list[bytes] = []
+    cable = BadCable(Faults(reorder=1.0), rng, left.append)
+    samples = itertools.islice(spin_samples(RATE, 1e6, (0.0, 0.0, 0.0)), sent)
+    send(cable, samples, threading.Event())
+    assert [decode(data).sequence for data in left] == sequences
+    assert cable.tally.total == sent
+
+
+def test_a_sender_that_is_stopped_lets_out_what_its_cable_holds_back(rng):
+    left: list[bytes] = []
+    stop = threading.Event()
+    cable = BadCable(Faults(reorder=1.0), rng, left.append)
+    samples = spin_samples(RATE, 1e6, (0.0, 0.0, 0.0))
+    send(cable, samples, stop, on_sent=lambda count: stop.set())
+    assert [decode(data).sequence for data in left] == [0]
+
+
+def test_a_packet_has_all_of_its_sample_but_the_time(rng):
+    left: list[bytes] = []
+    rate = np.array([0.25, 0.5, -0.125])  # of float32, as a packet has it
+    samples = [AttitudeSample(0, START, rate, 7), AttitudeSample(1, START, None, 8, True)]
+    send(BadCable(Faults(), rng, left.append), iter(samples), threading.Event())
+    first, last = map(decode, left)
+    assert first.q_icrs_to_cam.tolist() == START.tolist()
+    assert np.array_equal(first.rate_cam_rad_s, rate) and last.rate_cam_rad_s is None
+    assert [(each.sequence, each.discontinuity) for each in (first, last)] == [
+        (7, False),
+        (8, True),
+    ]
+    assert last.t_ns - first.t_ns == 1

@@ -124,6 +124,59 @@ def test_a_unit_goes_after_three_windows_of_another_pace_and_its_line_says_what_
     assert notices.counts().get("time-unit-right", 0) == (windows >= 3)
 
 
+# Windows of half a second: at the pace of microseconds, at 0.8 of that, and in nanoseconds.
+NAMED, NEAR, OTHER = 1e-3, 0.8e-3, 1.0
+
+
+def unit_after(paces: list[float]) -> tuple[TimeUnit, Notices]:
+    """What is said of a sender whose times run at these paces, half a second each."""
+    notices = Notices()
+    unit = TimeUnit(notices)
+    t_ns = 0.0
+    unit.see(0, 0)
+    for k in range(1, 50 * len(paces) + 1):
+        t_ns += paces[(k - 1) // 50] * NS_PER_S / 100
+        unit.see(round(t_ns), k * NS_PER_S // 100)
+    return unit, notices
+
+
+@pytest.mark.parametrize(
+    ("paces", "named"),
+    [
+        ([NAMED, OTHER, OTHER, OTHER], ""),
+        ([NAMED, OTHER, OTHER, NEAR, OTHER, OTHER], "microseconds"),
+        ([NAMED, OTHER, OTHER, NEAR, OTHER, OTHER, OTHER], ""),
+        ([NAMED, OTHER, OTHER, NAMED, OTHER, OTHER], "microseconds"),
+        ([NAMED, NEAR, NEAR, NEAR, NEAR], "microseconds"),
+        ([NEAR, NEAR, NEAR, NEAR], ""),
+    ],
+)
+def test_a_unit_goes_by_paces_in_a_row_and_not_by_their_number(paces, named):
+    """Uneven windows come again and again on a busy machine: one right one between them counts."""
+    unit, notices = unit_after(paces)
+    assert unit.named == named
+    assert bool(notices.lasting.get(UNIT)) is bool(named)
+
+
+@pytest.mark.parametrize(("packets", "named"), [(5, ""), (6, "microseconds")])
+def test_a_unit_is_told_by_five_intervals(packets, named):
+    unit = TimeUnit(Notices())
+    for k in range(packets):
+        unit.see(k * 200_000, k * NS_PER_S // 5)
+    assert unit.named == named
+
+
+@pytest.mark.parametrize("pause_s", [0.2, 20.0, 200.0])
+def test_a_pause_in_which_a_simulation_stands_is_of_no_unit(pause_s):
+    """0.2 s of it are a thousandth of 200 s."""
+    notices = Notices()
+    unit = TimeUnit(notices)
+    for k in range(200):
+        waited_s = pause_s * (k // 20)
+        unit.see(k * NS_PER_S // 100, k * NS_PER_S // 100 + round(waited_s * NS_PER_S))
+    assert not unit.named and UNIT not in notices.counts()
+
+
 def test_picoseconds_have_no_whole_factor():
     notices = Notices()
     unit = TimeUnit(notices)

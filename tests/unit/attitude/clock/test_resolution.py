@@ -43,6 +43,18 @@ def test_a_log_s_first_samples_say_in_which_steps_it_is(is_coarse_first):
     assert [kind for kind, _ in coarse_lines(samples)] == [COARSE] * is_coarse_first
 
 
+@pytest.mark.parametrize(("step", "is_told"), [(2.0**-17, True), (2.0**-18, False)])
+def test_a_step_of_less_than_an_arcsecond_is_not_worth_a_word(step, is_told):
+    """Steps of 1.57 and 0.79 arcsec."""
+    assert bool(coarse_lines(rounded_turn(lambda q: np.round(q / step) * step))) is is_told
+
+
+@pytest.mark.parametrize("count", [20, 49, 50])
+def test_a_log_of_few_samples_says_in_which_steps_it_is(count):
+    samples = rounded_turn(lambda q: np.round(q, 3), count)
+    assert [kind for kind, _ in coarse_lines(samples)] == [COARSE]
+
+
 @pytest.mark.parametrize("step", [2.0**-15, 1 / 32767])
 def test_fixed_point_numbers_are_told(step):
     assert (

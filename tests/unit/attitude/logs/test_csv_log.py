@@ -268,6 +268,34 @@ def test_rates_are_in_the_unit_of_their_columns_and_that_is_said(csv_of):
     )
 
 
+@pytest.mark.parametrize(
+    "row",
+    [
+        "1_0,1,0,0,0,0,0,0,5",
+        "0,0_1,0,0,0,0,0,0,5",
+        "0,1,0,0,0_0,0,0,0,5",
+        "0,1,0,0,0,1_0,0,0,5",
+        "0,1,0,0,0,0,0,0.1_0,5",
+        "0,1,0,0,0,0,0,0,1_0",
+    ],
+)
+def test_a_number_that_python_alone_reads_is_refused_in_every_column(csv_of, row):
+    """1_0 is 10 to it, and may be two numbers to who wrote it."""
+    path = csv_of(f"t_s,qw,qx,qy,qz,rx,ry,rz,sequence\n{row}\n")
+    with pytest.raises(InputError, match=re.escape(f"{path}:2: {row!r}")):
+        open_log(path)
+
+
+def test_a_table_with_decimal_commas_has_them_in_every_column(csv_of):
+    head = "t_ms;qw;qx;qy;qz;rx [deg/s];ry [deg/s];rz [deg/s]"
+    rows = "0,5;1,0;0,0;0,0;0,0;1,5;0;-3\n1500,25;0,5;-0,5;0,5;0,5;0;0,25;0"
+    first, last = open_log(csv_of(f"{head}\n{rows}\n")).samples
+    assert (first.t_ns, last.t_ns) == (500_000, 1_500_250_000)
+    assert last.q_icrs_to_cam.tolist() == [0.5, -0.5, 0.5, 0.5]
+    assert first.rate_cam_rad_s == pytest.approx(np.radians([1.5, 0.0, -3.0]))
+    assert last.rate_cam_rad_s == pytest.approx(np.radians([0.0, 0.25, 0.0]))
+
+
 def test_telemetry_has_the_rates_of_its_columns_in_their_unit(tmp_path: Path) -> None:
     path = tmp_path / "telemetry.csv"
     rows = ["0,1,0,0,0,1.8,0,-3.6,1", "1,1,0,0,0,,,,1", "2,0,0,0,0,9,9,9,0"]

@@ -110,6 +110,24 @@ def test_a_format_of_another_package_is_read_written_and_named(tmp_path, package
         write_log(tmp_path / "c.txt", samples)
 
 
+@pytest.mark.parametrize("name", ["a.CSV", "b.Jsonl", "c.json", "d.MCAP"])
+def test_a_log_is_written_by_the_ending_of_its_name_in_capitals_or_not(tmp_path, name):
+    (tmp_path / "log.csv").write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n1,0,1,0,0\n")
+    samples = read_log(tmp_path / "log.csv")
+    write_log(tmp_path / name, samples)
+    assert [sample.t_ns for sample in read_log(tmp_path / name)] == [0, 10**9]
+
+
+def test_a_file_with_the_magic_number_of_two_formats_is_what_any_such_file_is():
+    """A ledger is an MCAP file of a run: by its first bytes alone it is an MCAP file."""
+    ledger, mcap = (
+        next(form for form in formats.log_formats() if form.name == name)
+        for name in ("the ledger of a run", "an MCAP file")
+    )
+    assert ledger.magic == mcap.magic
+    assert {formats.kinds()[magic] for magic in mcap.magic} == {"an MCAP file"}
+
+
 def test_a_format_of_hilstar_s_is_tried_before_another_that_looks_as_close(package):
     """Both have a magic number and nothing else to look at: which comes first is hilstar's."""
     package("planetarium_log:FORMAT")
@@ -155,6 +173,26 @@ def test_a_pyproject_of_another_project_beside_the_package_is_not_taken(tmp_path
     assert formats._of_checkout(path) == []
     path.write_text('[project]\nname = "other"\n')
     assert formats._of_checkout(path) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("CCSDS_AEM_VERS = 1.0\n", "CCSDS_AEM_VERS"),
+        ("\n  \nCIC_AEM_VERS = 1.0\n", "CIC_AEM_VERS"),
+        ("COMMENT of the mission\nCCSDS_AEM_VERS = 1.0\n", "CCSDS_AEM_VERS"),
+        ("COMMENT\nCOMMENT two\nCIC_AEM_VERS = 1.0\n", "CIC_AEM_VERS"),
+        ("# by STK\n#\nstk.v.11.0\n", "stk.v.11.0"),
+        ("// of a run\n{}\n", "{}"),
+        ("COMMENTS = 1\n", "COMMENTS"),
+        ("# alone\nCOMMENT\n", ""),
+        ("", ""),
+    ],
+)
+def test_a_file_is_what_its_first_word_after_comments_says(tmp_path, text, word):
+    path = tmp_path / "a.txt"
+    path.write_text(text)
+    assert formats.LogHead(path, b"").word == word
 
 
 def test_reading_names_no_format_of_a_log_itself():

@@ -207,6 +207,58 @@ def test_rates_about_another_axis_say_nothing_of_the_times(inclined_deg, is_name
     assert bool(time_notices(samples, "s")) is is_named
 
 
+def test_a_turn_across_a_jump_says_nothing_of_the_times_and_one_after_it_does():
+    """A log of pairs 20 ms apart, its times in ms: before each pair it jumps about x."""
+    axis = np.array([0.0, 0.0, 1.0])
+    samples = []
+    for k in range(20):
+        turned = Rotation.from_rotvec(-0.002 * axis * (k % 2)) * Rotation.from_rotvec(
+            [k // 2, 0, 0]
+        )
+        q = turned.as_quat(scalar_first=True)
+        jumps = k % 2 == 0
+        samples.append(AttitudeSample(k * 20 * 10**9, q, 0.1 * axis, k, discontinuity=jumps))
+    ((_, said),) = time_notices(samples, "s")
+    assert "the times are in ms" in said
+
+
+def turning_in_ms(rates_rad_s: list[float | None], turns: list[float]) -> list[AttitudeSample]:
+    """A log about z whose times are in ms and read as s: samples 20 ms apart, with rates; by each
+    of `turns`, rad, it turns to the next.
+    """
+    samples = []
+    for k, rate in enumerate(rates_rad_s):
+        q = Rotation.from_rotvec([0, 0, -sum(turns[:k])]).as_quat(scalar_first=True)
+        known = None if rate is None else np.array([0.0, 0.0, rate])
+        samples.append(AttitudeSample(k * 20 * 10**9, q, known, k))
+    return samples
+
+
+ACCELERATING = [0.1 * 1.5**k for k in range(9)]
+# a gyroscope's own drift, of a body that rests
+RESTING = 1e-12
+
+
+@pytest.mark.parametrize(
+    ("rates_rad_s", "turns", "is_named"),
+    [
+        ([0.1] * 6, [0.002] * 5, True),
+        ([0.1] * 5, [0.002] * 4, False),  # too few intervals
+        ([0.1] * 5 + [RESTING] * 9, [0.002] * 4 + [0.0] * 9, False),
+        ([0.1] * 6 + [RESTING] * 9, [0.002] * 5 + [0.0] * 9, True),
+        ([0.1] * 6 + [None] + [0.1] * 2, [0.002] * 8, True),
+        ([0.1, None] * 6, [0.002] * 11, False),  # no interval has a rate at both of its ends
+        # by the mean of its ends' rates, 1.25 times the first
+        (ACCELERATING, [0.02 * 1.25 * rate for rate in ACCELERATING[:-1]], True),
+    ],
+)
+def test_the_unit_of_a_log_s_times_is_named_by_five_intervals_that_turn(
+    rates_rad_s, turns, is_named
+):
+    told = time_notices(turning_in_ms(rates_rad_s, turns), "s")
+    assert any("the times are in ms" in line for _, line in told) is is_named
+
+
 def test_the_ratio_of_rates_and_turns_is_that_of_most_intervals():
     """One rate of twenty is a hundred times as long as the others."""
     turned = np.tile([0.01, 0.0, 0.0], (20, 1))

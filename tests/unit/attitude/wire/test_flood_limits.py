@@ -100,6 +100,17 @@ def test_a_jump_that_is_taken_anyway_is_not_taken_twice_where_few_are_passed_ove
     assert counts.flooded == 3
 
 
+@pytest.mark.parametrize("oldest", [0, 1, 2])
+def test_of_a_few_that_are_passed_over_each_may_be_the_jump_that_is_taken(oldest):
+    clock, counts = FakeClock(), LinkCounts()
+    gate = FloodGate(counts, Notices(), clock)
+    gate.newest([RawMessage(k, [b""]) for k in range(MAX_BURST)], plain)
+    clock.work(2.5 / MAX_PACKETS_PER_S * NS_PER_S)
+    waiting = [RawMessage(k, [b"jump" if k == oldest else b""]) for k in range(5)]
+    assert gate.newest(waiting, bool) == [waiting[oldest], *waiting[3:]]
+    assert counts.flooded == 2
+
+
 @pytest.mark.parametrize("sender", [0, 1, 2, 4, 253])
 @pytest.mark.parametrize("sequence", [0, 1, 2, 255, 256, 2**16, 2**32 - 1])
 def test_a_jump_is_seen_undecoded_whatever_else_a_frame_has(sender, sequence):

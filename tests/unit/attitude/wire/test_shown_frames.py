@@ -53,6 +53,11 @@ def test_a_frame_comes_back_as_it_was_shown(bits, channels, largest):
         lambda parts: [parts[0], parts[1][:-1], parts[2]],
         lambda parts: [parts[0], parts[1], parts[2] + b"\1"],
         lambda parts: [parts[0].replace(b'"channels":1', b'"channels":3'), *parts[1:]],
+        lambda parts: [parts[0].replace(b'"bits":8', b'"bits":17'), parts[1], bytes(4)],
+        lambda parts: [parts[0].replace(b'"bits":8', b'"bits":0'), *parts[1:]],
+        lambda parts: [parts[0].replace(b'"channels":1', b'"channels":2'), *parts[1:]],
+        # of 15 pixels the last one is index 14
+        lambda parts: [parts[0], parts[1].replace(b"\x0e", b"\x0f"), parts[2]],
     ],
 )
 def test_what_is_no_frame_is_refused(change):
@@ -150,6 +155,11 @@ def test_a_watcher_goes_on_whatever_another_subscribes_to_and_however_it_leaves(
     wait_for(lambda: not frame_sender.look(), "nobody watches any more")
 
 
+def topics(kind: bytes, count: int) -> list[tuple[int, bytes]]:
+    """What connection 7 says of so many topics: that it subscribes, or no more."""
+    return [(7, kind + b'{"frame":%d' % k) for k in range(count)]
+
+
 @pytest.mark.parametrize(
     ("said", "watching"),
     [
@@ -160,6 +170,9 @@ def test_a_watcher_goes_on_whatever_another_subscribes_to_and_however_it_leaves(
         ([(7, b"\1{"), (8, b"\0{")], {7}),  # of another connection, which had none
         ([(7, b"\1{"), (7, b"\0")], {7}),
         ([(7, b"\1other"), (8, b"\2{")], set()),
+        # of more topics than are recorded some are left when all that are recorded have ended
+        ([*topics(b"\1", MAX_TOPICS + 1), *topics(b"\0", MAX_TOPICS)], {7}),
+        ([*topics(b"\1", MAX_TOPICS - 1), *topics(b"\0", MAX_TOPICS - 1)], set()),
     ],
 )
 def test_each_connection_watches_from_its_subscription_to_its_own_end_of_it(

@@ -6,10 +6,12 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.units import NS_PER_S
@@ -24,13 +26,13 @@ from hilstar.instruments.simulate.exposures import faulty_exposure
 from hilstar.instruments.simulate.glass import _in_glass_square, told_psf
 from hilstar.instruments.simulate.optics import TwinOptics
 from hilstar.instruments.simulate.simulator import Simulator
-from hilstar.optics.camera import Lens
+from hilstar.optics.camera import Camera, Lens
 from hilstar.optics.glass.glass_psf import GlassPsf, NodeSpline
 from hilstar.optics.glass.psf_file import glass_of, write_glass
 from hilstar.optics.psf import GaussianPsf
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.cameras import tracker_camera, tracker_psf
-from hilstar.server.bench.glass import say_once
+from hilstar.server.bench.glass import Onto, _glass_on_display, say_once
 from hilstar.server.bench.scenario import parse_scenario
 from hilstar.server.bench.star_glass import BAND_NM, StarGlass
 from hilstar.server.bench.star_light import bench_stars
@@ -283,6 +285,48 @@ def test_a_told_glass_is_what_is_drawn_about_a_pixel_at_each_star_s_place(glass_
         # drawn in float32
         assert square == pytest.approx(about, abs=1e-6)
         assert square.sum() > 0.9
+
+
+@pytest.mark.parametrize(
+    ("resolution_px", "moved_px", "beyond_px"),
+    [
+        ((SIDE_PX + 44, SIDE_PX), (0, 20), 48),  # a corner: the hypotenuse of 44 and 20
+        ((SIDE_PX + 44, SIDE_PX), (30, 0), 30),  # on the left; 14 are left on the right
+        ((SIDE_PX, SIDE_PX + 44), (0, 30), 30),
+        ((SIDE_PX, SIDE_PX + 44), (20, 0), 48),
+    ],
+)
+def test_how_far_a_detector_reaches_beyond_the_points_is_told_of_its_farthest_corner(
+    glass_file, caplog, resolution_px, moved_px, beyond_px
+):
+    """Points from corner to corner of a square, which the lens moves by its decentre."""
+    right_um, down_um = (10.0 * px for px in moved_px)
+    tracker = glass_file(
+        {
+            "tracker": {"resolution_px": resolution_px, "pixel_pitch_um": 10.0},
+            "tracker.optics": {"decentre_x_um": right_um, "decentre_y_um": down_um},
+        }
+    )
+    tracker_psf(tracker.config.tracker, tracker.folder)
+    assert f"reaches {beyond_px} px beyond the file's points" in caplog.text
+
+
+def test_a_turned_display_has_the_lens_s_points_and_its_lateral_colour_turned(rng):
+    """By 30 degrees, and 1.5 of its pixels to one of the tracker's: both without distortion."""
+    turn = Rotation.from_euler("z", 30.0, degrees=True).as_matrix()
+    middle_px = (127.5, 100.0)
+    tracker = Camera((SIDE_PX, SIDE_PX), 1000.0, middle_px, np.eye(3))
+    display = Camera((800, 600), 1500.0, (400.0, 300.0), turn)
+    lateral_px = rng.normal(size=usual_glass().lateral_px.shape)
+    glass = replace(usual_glass(), lateral_px=lateral_px)
+    shown = _glass_on_display(glass, Onto(display, tracker))
+    onto_display = 1.5 * turn[:2, :2]
+    off_px = glass.places_px - middle_px
+    wanted_px = np.array([400.0, 300.0]) + off_px @ onto_display.T
+    assert shown.places_px == pytest.approx(wanted_px, abs=2e-6)
+    moved_px = lateral_px.reshape(-1, 2) @ onto_display.T
+    # `matrix` is by differences, good to 1e-9
+    assert shown.lateral_px.reshape(-1, 2) == pytest.approx(moved_px, abs=1e-6)
 
 
 def test_what_the_file_does_not_cover_is_said(glass_file, caplog):

@@ -98,6 +98,22 @@ def test_the_attitude_is_off_by_the_farther_end_of_the_widest_of_its_axes() -> N
     assert whole.line == "certificate HS-1 of 2026-03-01, valid until 2027-03-01"
 
 
+@pytest.mark.parametrize(
+    ("latencies", "late_ms"),
+    [
+        ([(14.0, 17.0)], 2.0),
+        ([(11.0, 16.0)], 4.0),
+        ([(12.0, 13.0)], 3.0),  # the whole interval is before what is stated
+        ([(15.5, 16.0), (14.5, 15.25), (13.0, 15.0)], 2.0),
+        ([], None),
+    ],
+)
+def test_light_is_late_or_early_by_the_farther_end_from_what_is_stated(latencies, late_ms) -> None:
+    """Stated: 15 ms."""
+    figures = [figure("latency", *ends) for ends in latencies]
+    assert certificate(figures=[*FIGURES, *figures]).late_ms(15.0) == late_ms
+
+
 @pytest.mark.parametrize("without", ["attitude_z", "attitude_x"])
 def test_an_attitude_of_which_an_axis_was_not_assessed(without: str) -> None:
     """Of the two across the boresight one stands for both."""

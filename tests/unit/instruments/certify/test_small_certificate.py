@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from hilstar.instruments.certify import assembly, certificate
 from hilstar.instruments.certify.budget import BATCH
@@ -234,3 +235,14 @@ def test_without_readings_a_bench_is_as_its_file_says_and_nothing_of_it_is_known
     assert made.figures == []
     assert made.conforms is None
     assert any(reason.startswith("latency:") for reason in made.not_assessed)
+
+
+def test_without_readings_a_delay_is_as_stated_with_its_own_uncertainty(bench, stars) -> None:
+    certify = structs.replace(bench.config.certify, panel_delay_u_ms=0.2)
+    stated = replace(bench, config=structs.replace(bench.config, certify=certify))
+    (latency,) = of_quantity(certified(stated, None, stars), "latency")
+    assert latency.value == pytest.approx(DELAY_MS, abs=1e-3)
+    half_ms = (latency.upper - latency.lower) / 2
+    # what the checks changed by is anywhere within it
+    sigma_ms = math.hypot(0.2, CHANGES["latency"] / math.sqrt(3))
+    assert half_ms == pytest.approx(1.96 * sigma_ms, rel=0.01)

@@ -16,7 +16,7 @@ from msgspec import structs
 
 from hilstar.instruments.certify import assembly, certificate
 from hilstar.instruments.certify.budget import BATCH
-from hilstar.instruments.certify.model import ReferenceStar
+from hilstar.instruments.certify.model import Figures, ReferenceStar
 from hilstar.instruments.certify.sky_effects import catalogue_errors
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
 from hilstar.server.bench.catalogue import bench_catalogue
@@ -246,3 +246,13 @@ def test_without_readings_a_delay_is_as_stated_with_its_own_uncertainty(bench, s
     # what the checks changed by is anywhere within it
     sigma_ms = math.hypot(0.2, CHANGES["latency"] / math.sqrt(3))
     assert half_ms == pytest.approx(1.96 * sigma_ms, rel=0.01)
+
+
+def test_a_bench_as_its_file_says_has_its_delay_and_no_error(bench, stars) -> None:
+    figures = Figures(bench, stars)
+    (found,) = figures.of(assembly._as_stated(bench, figures))
+    for (quantity, _, _), value in zip(figures.names, found.tolist(), strict=True):
+        if quantity == "latency":
+            assert value == DELAY_MS
+        else:
+            assert value == pytest.approx(0.0, abs=1e-6), quantity

@@ -314,6 +314,34 @@ def test_rates_that_are_left_out_are_said_with_how_many(rng: np.random.Generator
     assert [note.partition(":")[0] for note in said] == ["rate noise, cross", "rate noise, roll"]
 
 
+def test_rates_at_the_ends_of_a_run_count_for_nothing(rng: np.random.Generator) -> None:
+    """Their angular acceleration is not known: what was shown before and after is not, either."""
+    count = 400
+    run_s = np.arange(0.0, 90.0, 0.05)
+    commanded = Commanded(run_s, scalar_first(attitude(motion, run_s)))
+    t_s = np.linspace(run_s[0], run_s[-1], count)
+    moments = commanded.at(t_s)
+    reported_rad_s = moments.rate_rad_s + np.radians(0.01) * rng.standard_normal((count, 3))
+    found = replace(
+        slewing(count, 0.0),
+        clock=replace(a_clock(), t_s=t_s),
+        rate_rad_s=moments.rate_rad_s,
+        commanded_q=moments.q,
+    )
+    valid = np.ones(count, dtype=bool)
+    t_ns = np.round(1e9 * t_s).astype(np.int64)
+    lines = np.arange(count) + 2
+    telemetry = Telemetry(
+        Path("t.csv"), t_ns, moments.q, valid, lines, rate_cam_rad_s=reported_rad_s
+    )
+    further = FurtherFigures()
+    add_rates(further, telemetry, commanded, found)
+    bias = {row.axis: row.value for row in further.rows if row.quantity == "rate bias"}
+    assert bias == pytest.approx({"cross": 0.0, "roll": 0.0}, abs=0.005)
+    lag = {row.axis: row.value for row in further.rows if row.quantity == "rate lag"}
+    assert lag == pytest.approx({"cross": 0.0, "roll": 0.0}, abs=0.1)
+
+
 def test_a_stamp_s_jitter_has_back_what_the_budget_s_fits_took() -> None:
     """10 ms of 400 answers; where a field took 99 numbers, as of 300."""
     values = []

@@ -19,6 +19,7 @@ from hilstar.instruments.assess import page, report
 from hilstar.instruments.assess.assessment import Acquisition, Assessment, WrongAnswer
 from hilstar.instruments.assess.budget import Axes
 from hilstar.instruments.assess.clock import ClockFit
+from hilstar.instruments.assess.figure_rows import FigureRow, figures_table
 from hilstar.server.record.commanded_run import CommandedRun
 from tests.support.assessments import RIGHT, T_S, VALID, a_run, an_assessment, as_json
 from tests.support.card_texts import BAND, card_lines, drawn_figures
@@ -526,3 +527,24 @@ def test_a_bench_could_have_made_no_more_than_all_of_a_bias(made: Assessment) ->
     off = [each for each in a_certificate().figures if each.quantity != "attitude_z"]
     unassessed = report.bench_part(a_certificate(figures=off), found)
     assert unassessed["off_arcsec"] is unassessed["share_of_bias"] is None
+
+
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [
+        (FigureRow("bias", "x", -3.0, "arcsec"), ["x", "-3 arcsec"]),
+        (FigureRow("bias", "z", 4.0, "arcsec"), ["about the boresight", "4 arcsec"]),
+        (FigureRow("noise", "cross", 2.0, "px", 1.0, 3.0), ["across", "2.0 (1.0 to 3.0) px"]),
+        (FigureRow("noise", "roll", 0.5, "s"), ["about the boresight", "0.5 s"]),
+        (FigureRow("answers due", "", 16), ["16"]),
+        (FigureRow("availability", "", 0.5625), ["56.25 %"]),
+        (FigureRow("rate scale", "", 0.02, "1", 0.01, 0.03), ["2.0 (1.0 to 3.0) %"]),
+        (FigureRow("share seen", "", 0.12345678), ["12.35 %"]),
+        (FigureRow("acquisition probability", "", 1.0), ["100 %"]),
+    ],
+)
+def test_a_figure_stands_under_its_axis_in_words_and_a_share_in_percent(
+    row: FigureRow, words: list[str]
+) -> None:
+    cells = re.findall("<td>(.*?)</td>", figures_table([row]))
+    assert cells[1:] == words

@@ -30,7 +30,12 @@ from hilstar.instruments.campaign.requirements import (
     judged_figure,
     verdicts_of,
 )
-from hilstar.instruments.campaign.star_motion import YEARS
+from hilstar.instruments.campaign.star_motion import (
+    OBSERVER_KM_S,
+    PARALLAX_TURN,
+    YEARLY_TURN,
+    YEARS,
+)
 from tests.support.planted_answers import (
     CASES,
     FRAMES,
@@ -394,6 +399,41 @@ def test_places_of_one_date_tell_no_motion(rng: np.random.Generator) -> None:
     verdict = figure_verdict(one_date, "proper-motion", maximum=1.0)
     assert (verdict.value, verdict.method) == (None, "cases at several dates tell it")
     assert figure_verdict(one_date, "catalogue-age", maximum=100.0).value is not None
+
+
+@pytest.mark.parametrize(
+    ("quantity", "gap"),
+    [
+        ("parallax", "error_y_arcsec"),
+        ("parallax", PARALLAX_TURN.format("y")),
+        ("parallax", OBSERVER_KM_S.format("z")),
+        ("proper-motion", "error_y_arcsec"),
+        ("proper-motion", YEARLY_TURN.format("y")),
+    ],
+)
+def test_a_case_without_all_of_a_turn_tells_nothing_of_it(
+    quantity: str, gap: str, rng: np.random.Generator
+) -> None:
+    cases = old_places(rng, proper_motion=0.5, parallax=0.5)
+    whole = figure_verdict(cases, quantity, maximum=1.0)
+    values = cases.numbers[gap].copy()
+    values[:3] = np.nan
+    some = dataclasses.replace(cases, numbers=cases.numbers | {gap: values})
+    fewer = figure_verdict(some, quantity, maximum=1.0)
+    assert fewer.cases == whole.cases - 3
+    assert fewer.value is not None and math.isfinite(fewer.value)
+
+
+def test_a_parallax_is_told_with_how_far_it_turns_a_field_in_both_axes(
+    rng: np.random.Generator,
+) -> None:
+    cases = old_places(rng, parallax=0.5)
+    numbers = dict(cases.numbers)
+    for axis, turn_arcsec in (("x", 3.0), ("y", 4.0)):
+        name = PARALLAX_TURN.format(axis)
+        numbers[name] = turn_arcsec * np.sign(numbers[name])
+    found = figure_verdict(dataclasses.replace(cases, numbers=numbers), "parallax", maximum=9.0)
+    assert "turns of 5 arcsec rms" in found.method
 
 
 def test_cases_without_a_frame_that_reports_stars_tell_nothing_of_false_ones(

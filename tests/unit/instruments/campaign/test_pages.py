@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from matplotlib.figure import Figure
+from msgspec import structs
 from scipy.stats import beta, binom
 
 from hilstar.basics.arrays import FloatArray
@@ -34,7 +35,7 @@ from hilstar.instruments.campaign.acceptance_verdicts import (
     ClauseVerdict,
     SetResult,
 )
-from hilstar.instruments.campaign.case_table import Columns
+from hilstar.instruments.campaign.case_table import Columns, read_cases
 from hilstar.instruments.campaign.page import MeasureCosts, verdict_of, write_campaign_page
 from hilstar.instruments.campaign.plan import parse_plan
 from hilstar.instruments.campaign.requirements import (
@@ -175,6 +176,21 @@ def test_the_chart_has_each_case_s_error_an_axis_about_the_median_at_its_rate(re
     assert 30.0 < axes.get_ylim()[1] < 5e3
     met = [each.verdict for each in verdicts].count(MET)
     assert figure.get_suptitle() == f"{met} of 3 requirements are met"
+
+
+def test_the_chart_of_errors_across_has_the_limits_of_such_errors_alone(
+    tmp_path: Path, required
+) -> None:
+    write_cases(tmp_path / "cases.parquet")
+    cases = read_cases(tmp_path / "cases.parquet")
+    of_nea = required[1][1]
+    verdicts = []
+    for number, axis in enumerate((None, "cross", "x", "y", "z", "roll")):
+        require = structs.replace(of_nea.require, axis=axis, maximum=10.0 + number)
+        verdicts.append(replace(of_nea, require=require))
+    (axes,) = requirements_page._chart(cases, verdicts).axes
+    _, _, *limits = axes.get_lines()
+    assert [float(line.get_ydata()[0]) for line in limits] == [10.0, 11.0, 12.0, 13.0]
 
 
 @pytest.mark.parametrize(

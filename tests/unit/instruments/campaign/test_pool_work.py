@@ -18,6 +18,7 @@ from hilstar.instruments.campaign.job import Answered, Identity, Job
 from hilstar.instruments.campaign.plan import Design
 from hilstar.instruments.campaign.pool import MAX_STARTS_LOST, Pool
 from hilstar.instruments.campaign.run import Campaign
+from hilstar.instruments.campaign.session import Session
 from hilstar.instruments.campaign.store import Directory, Journal
 from tests.support.campaigns import read_columns, write_campaign
 
@@ -187,8 +188,18 @@ def test_as_many_workers_run_as_fit_by_the_largest_peak_so_far(
 def test_the_workers_of_one_campaign_run_the_cases_of_the_next(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Real sessions: plans that differ in their seed, on one worker that stays."""
+    """Real sessions: plans that differ in their seed, on one worker that stays, and that frees the
+    first one's GL contexts before it takes up the second.
+    """
+    closed = []
+
+    class NotedSession(Session):
+        def close(self) -> None:
+            closed.append(self.job)
+            super().close()
+
     monkeypatch.setattr(pool, "ProcessPool", WorkersHere([WORKS]))
+    monkeypatch.setattr(pool, "Session", NotedSession)
     campaigns = []
     for seed in (1, 2):
         folder = tmp_path / str(seed)
@@ -212,3 +223,4 @@ def test_the_workers_of_one_campaign_run_the_cases_of_the_next(
             assert rows["bench_sha256"] == [campaign.file.sha256] * 2
             assert rows["status"] == ["done"] * 2
     assert first.job != second.job
+    assert closed == [first.job]

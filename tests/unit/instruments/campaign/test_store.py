@@ -5,6 +5,7 @@ are the rows' alone.
 from __future__ import annotations
 
 import contextlib
+import os
 import random
 import zlib
 from pathlib import Path
@@ -229,3 +230,31 @@ def test_blocks_hold_all_cases_and_one_that_is_full_takes_no_more(
     assert again.done == cases
     assert not any(again.missing(block) for block in range(blocks))
     again.close()
+
+
+def test_a_block_is_on_the_disk_before_it_has_the_name_of_a_full_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a loss of power a full block is read as it is; its file is closed at once, as a campaign
+    has more blocks than a process may have files.
+    """
+    journal = Journal(tmp_path, 8)
+    sync = os.fsync
+    synced = []
+    opened = []
+
+    def seen_sync(fd: int) -> None:
+        names = [path.name for path in tmp_path.iterdir()]
+        synced.append((names, os.fstat(fd).st_size))
+        opened.append(fd)
+        sync(fd)
+
+    monkeypatch.setattr(os, "fsync", seen_sync)
+    journal.append([row(case) for case in range(8)])
+    (fd,) = opened
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(fd)
+    journal.close()
+    (full,) = tmp_path.iterdir()
+    assert synced == [(["000000.jsonl"], full.stat().st_size)]
+    assert full.name != "000000.jsonl"

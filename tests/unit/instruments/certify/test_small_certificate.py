@@ -12,10 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from hilstar.instruments.certify import assembly, certificate
 from hilstar.instruments.certify.budget import BATCH
-from hilstar.instruments.certify.model import ReferenceStar
+from hilstar.instruments.certify.model import Figures, ReferenceStar
 from hilstar.instruments.certify.sky_effects import catalogue_errors
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
 from hilstar.server.bench.catalogue import bench_catalogue
@@ -234,3 +235,24 @@ def test_without_readings_a_bench_is_as_its_file_says_and_nothing_of_it_is_known
     assert made.figures == []
     assert made.conforms is None
     assert any(reason.startswith("latency:") for reason in made.not_assessed)
+
+
+def test_without_readings_a_delay_is_as_stated_with_its_own_uncertainty(bench, stars) -> None:
+    certify = structs.replace(bench.config.certify, panel_delay_u_ms=0.2)
+    stated = replace(bench, config=structs.replace(bench.config, certify=certify))
+    (latency,) = of_quantity(certified(stated, None, stars), "latency")
+    assert latency.value == pytest.approx(DELAY_MS, abs=1e-3)
+    half_ms = (latency.upper - latency.lower) / 2
+    # what the checks changed by is anywhere within it
+    sigma_ms = math.hypot(0.2, CHANGES["latency"] / math.sqrt(3))
+    assert half_ms == pytest.approx(1.96 * sigma_ms, rel=0.01)
+
+
+def test_a_bench_as_its_file_says_has_its_delay_and_no_error(bench, stars) -> None:
+    figures = Figures(bench, stars)
+    (found,) = figures.of(assembly._as_stated(bench, figures))
+    for (quantity, _, _), value in zip(figures.names, found.tolist(), strict=True):
+        if quantity == "latency":
+            assert value == DELAY_MS
+        else:
+            assert value == pytest.approx(0.0, abs=1e-6), quantity

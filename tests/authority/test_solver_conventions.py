@@ -58,7 +58,7 @@ def test_tetra3rs_answers_in_hilstars_convention(bright_sky, slopes_in_field):
 
 
 def test_ruststartracker_has_the_scalar_last_and_the_conjugate(bright_sky, slopes_in_field):
-    solver = pytest.importorskip("ruststartracker")
+    solver = pytest.importorskip("ruststartracker", reason="ruststartracker is not installed")
     middle_px = (SIDE_PX - 1) / 2
     matrix = np.array([[FOCAL_PX, 0, middle_px], [0, FOCAL_PX, middle_px], [0, 0, 1.0]])
     camera = solver.CameraParameters(
@@ -77,7 +77,7 @@ def test_ruststartracker_has_the_scalar_last_and_the_conjugate(bright_sky, slope
 
 
 def test_cedar_answers_hilstars_roll(slopes_in_field):
-    solver = pytest.importorskip("tetra3").Tetra3()
+    solver = pytest.importorskip("tetra3", reason="tetra3 is not installed").Tetra3()
     rows = slopes_in_field[0][:30, ::-1] * FOCAL_PX + SIDE_PX / 2
     answer = solver.solve_from_centroids(rows, (SIDE_PX, SIDE_PX), fov_estimate=FIELD_DEG)
     found_deg = [answer["RA"], answer["Dec"], answer["Roll"]]

@@ -249,8 +249,11 @@ def test_without_readings_a_delay_is_as_stated_with_its_own_uncertainty(bench, s
 
 
 def test_a_bench_as_its_file_says_has_its_delay_and_no_error(bench, stars) -> None:
-    figures = Figures(bench, stars)
-    (found,) = figures.of(assembly._as_stated(bench, figures))
+    """At a rate, at which a late star would stand beside its place."""
+    certify = structs.replace(bench.config.certify, rate_deg_s=1.0)
+    stated = replace(bench, config=structs.replace(bench.config, certify=certify))
+    figures = Figures(stated, stars)
+    (found,) = figures.of(assembly._as_stated(stated, figures))
     for (quantity, _, _), value in zip(figures.names, found.tolist(), strict=True):
         if quantity == "latency":
             assert value == DELAY_MS

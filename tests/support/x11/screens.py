@@ -124,7 +124,10 @@ class Shown:
             if pixels.shape == wanted.shape and (pixels == wanted).all():
                 return pixels
             code = self._process.poll()
-            assert code is None, f"the run ended with {code}: {self._process.communicate()[1]}"
+            assert code is None, (
+                f"the run ended with {code}, {difference(pixels, wanted)}:"
+                f" {self._process.communicate()[1]}"
+            )
             time.sleep(0.05)
         return self._screen.pixels()
 
@@ -138,6 +141,20 @@ class Shown:
         out, err = self._process.communicate(timeout=PATIENCE_S)
         assert self._process.returncode == 0, err
         return json.loads(out)
+
+
+def difference(pixels: np.ndarray, wanted: np.ndarray) -> str:
+    """Where and by how much a screen is not what was wanted of it."""
+    if pixels.shape != wanted.shape:
+        return f"the screen {pixels.shape}, not {wanted.shape}"
+    rows, columns = np.nonzero((pixels != wanted).any(axis=2))
+    if not len(rows):
+        return "as wanted at last"
+    shown, asked = pixels[rows[0], columns[0]], wanted[rows[0], columns[0]]
+    return (
+        f"{len(rows)} pixels other in rows {rows.min()} to {rows.max()}, columns {columns.min()} to"
+        f" {columns.max()}, the first {shown} for {asked}"
+    )
 
 
 def recorded(ledger: Path) -> list[FrameRecord]:

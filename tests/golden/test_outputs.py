@@ -77,9 +77,9 @@ COMMANDS = {
         "compare a.fits a.fits",
     ],
     "other_benches": [
-        f"frame {ROOT}/configs/microdisplay.toml --star Vega --explain",
-        f"frame {ROOT}/configs/rosetta-navcam.toml --star Sirius,40 --explain --json",
-        f"frame {ROOT}/configs/thesis-orion.toml --radec 5h36m14s,-1d12m,0 --explain",
+        "frame configs/microdisplay.toml --star Vega --explain",
+        "frame configs/rosetta-navcam.toml --star Sirius,40 --explain --json",
+        "frame configs/thesis-orion.toml --radec 5h36m14s,-1d12m,0 --explain",
     ],
     "catalogue": ["catalogue bench.toml --faintest 2 -o stars.csv"],
     "verify": ["verify bench.toml --fields 1 --seed 3", "verify bench.toml --fields 1 --json"],
@@ -96,6 +96,8 @@ COMMANDS = {
 def outputs_of(name: str, folder: Path) -> str:
     """All that the commands of a name print and write as text, in a folder, a part each."""
     (folder / "bench.toml").write_text(ROLLING)
+    # by a name without the checkout's folder, which may have spaces
+    (folder / "configs").symlink_to(ROOT / "configs")
     (folder / "slew.csv").write_bytes((ROOT / "examples" / "slew.csv").read_bytes())
     parts = []
     for command in COMMANDS[name]:

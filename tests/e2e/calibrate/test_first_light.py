@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -362,7 +363,7 @@ def test_a_command_that_fails_is_a_failed_step_and_what_needs_it_is_not_done(tmp
         bench_text(TWIN, {"tracker": {"exposure_s": 0.045}, "render": {"tolerance_px": 0.02}})
     )
     fails = (
-        f"{sys.executable} -c \"import sys; sys.exit('camera 3 is not there')\" {{pattern}}"
+        f"{shlex.quote(sys.executable)} -c \"import sys; sys.exit('camera 3 is not there')\" {{pattern}}"
         " {output}"
     )
     result = go(tmp_path, "--grab", fails, "--json")

@@ -5,6 +5,7 @@ hot pixels and a dark frame.
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 import sys
 
@@ -101,7 +102,7 @@ def grabbing(session, folder):
         f"taken, = pathlib.Path({str(session)!r}).glob(output.stem + '.*')\n"
         "shutil.copy(taken, output)\n"
     )
-    return f"{sys.executable} {script} {{output}} {{pattern}}"
+    return f"{shlex.quote(sys.executable)} {script} {{output}} {{pattern}}"
 
 
 def test_images_that_are_taken_here_give_what_their_files_give(session, given, tmp_path):

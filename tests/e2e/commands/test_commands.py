@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -393,7 +394,7 @@ def test_an_unwritable_directory_is_refused(tmp_path, small_bench_file):
 
 
 def test_output_to_a_closed_pipe_leaves_no_traceback():
-    command = f"{sys.executable} -m hilstar doctor | true"
+    command = f"{shlex.quote(sys.executable)} -m hilstar doctor | true"
     result = subprocess.run(
         ["bash", "-c", command], capture_output=True, text=True, env=os.environ, check=False
     )

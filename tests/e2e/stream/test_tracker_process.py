@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 import os
 import select
+import shlex
 import socket
 import subprocess
 import sys
@@ -135,7 +136,8 @@ def test_an_outside_command_finds_the_attitude_and_prediction_follows_it(display
     """The example's solver gets a FITS file; on a busy machine it takes seconds, and the
     exposure after that one follows.
     """
-    solver = f"{sys.executable} {ROOT / 'examples' / 'star_solver.py'} {{image}} {25e3 / 13}"
+    program = shlex.join([sys.executable, str(ROOT / "examples" / "star_solver.py")])
+    solver = f"{program} {{image}} {25e3 / 13}"
     with tracker_of_display(
         display, "--answer", f"udp://127.0.0.1:{free_port()}", "--duration", 4, "--solver", solver
     ) as process:

@@ -107,7 +107,6 @@ def test_a_user_of_a_container_has_a_number_for_a_name_and_may_have_no_home(monk
     """As `docker run --user 1234` has it."""
     for name in ("LOGNAME", "USER", "LNAME", "USERNAME", "HOME"):
         monkeypatch.delenv(name, raising=False)
-    assert user_name() == pwd.getpwuid(os.getuid()).pw_name
 
     def unknown(uid: int):
         raise KeyError(f"getpwuid(): uid not found: {uid}")

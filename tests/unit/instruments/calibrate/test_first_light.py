@@ -5,6 +5,7 @@ command.
 from __future__ import annotations
 
 import math
+import shlex
 import sys
 from dataclasses import replace
 from types import SimpleNamespace
@@ -380,7 +381,7 @@ def test_a_command_is_told_the_exposure_and_must_write_a_new_image(tmp_path):
     [
         (
             (
-                f"{sys.executable} -c \"import sys; sys.exit('no camera on bus 3')\" {{pattern}}"
+                f"{shlex.quote(sys.executable)} -c \"import sys; sys.exit('no camera on bus 3')\" {{pattern}}"
                 " {output}"
             ),
             "no camera on bus 3",

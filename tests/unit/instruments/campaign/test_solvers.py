@@ -5,6 +5,7 @@ case's row.
 from __future__ import annotations
 
 import resource
+import shlex
 import signal
 import sys
 from dataclasses import replace
@@ -68,7 +69,8 @@ def solver(text: str, folder: Path = EXAMPLES, timeout_s: float = 60.0):
         "centroids",
         "python:star_solver:solve",
         pytest.param(
-            f"{sys.executable} star_solver.py {{image}} {{focal_length_px}}", marks=pytest.mark.e2e
+            f"{shlex.quote(sys.executable)} star_solver.py {{image}} {{focal_length_px}}",
+            marks=pytest.mark.e2e,
         ),
     ],
 )

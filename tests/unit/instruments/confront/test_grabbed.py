@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 import time
 from contextlib import closing
@@ -49,7 +50,7 @@ def by_command(planted):
         "assert float(sys.argv[2]) == 0.25\n"
         f"shutil.copy({str(folder / 'sky.png')!r}, sys.argv[1])\n"
     )
-    grab = f"{sys.executable} {script} {{output}} {{exposure_s}}"
+    grab = f"{shlex.quote(sys.executable)} {script} {{output}} {{exposure_s}}"
     words = ("--grab", grab, "--exposure", "0.25", "--count", "1")
     return confronted(folder, *words, "-o", folder / "by_command", *AT)["camera"]
 

@@ -30,6 +30,7 @@ def on_terminal(monkeypatch):
     def begun():
         monkeypatch.setenv("TERM", "xterm")
         monkeypatch.setenv("COLUMNS", "80")
+        monkeypatch.delenv("NO_COLOR", raising=False)
         stream = Terminal()
         monkeypatch.setattr(sys, "stderr", stream)
         return stream

@@ -5,6 +5,7 @@ takes nothing.
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import socket
 import time
@@ -205,6 +206,7 @@ def test_what_is_no_serial_port_gets_one_line_and_stays_as_it_is(tmp_path, kind)
 def test_memory_that_is_used_is_seen_at_most_every_look():
     clock = FakeClock()
     watch = _MemoryWatch(clock)
+    gc.collect()  # what earlier tests held must not be returned meanwhile
     watch.begin()
     kept = np.ones(GROWN_BYTES // 8)
     assert watch.grown_bytes() == pytest.approx(kept.nbytes, rel=0.1)

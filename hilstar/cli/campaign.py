@@ -299,7 +299,9 @@ def run_cases(this: "Campaign", directory: "Directory", opened: "Workers") -> No
 def telling(
     cases: int, clock_s: Callable[[], float] = time.monotonic
 ) -> Iterator[Callable[[int], None]]:
-    """Progress with the time left: a bar on a terminal, elsewhere a line every ten seconds."""
+    """Progress with the time left: a bar on a terminal that can erase it, elsewhere a line every
+    ten seconds.
+    """
     if erases_lines():
         with progress("cases", cases) as advance:
             yield advance

@@ -17,7 +17,7 @@ from typing import IO, Literal
 
 from hilstar.attitude.logs.entries import MAX_QUOTED_CHARACTERS, LogEntry, LogReading, Stated
 from hilstar.attitude.logs.log_formats import MAX_LOG_BYTES, LogFormat, Writing, readable
-from hilstar.attitude.logs.log_times import ns_of_seconds
+from hilstar.attitude.logs.log_times import ns_of_seconds, refuse_grouped
 from hilstar.attitude.logs.packet_logs import LIKE_PACKETS, of_packets
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, checked_sample
 from hilstar.attitude.wire.source import HILSTARS
@@ -253,12 +253,6 @@ class CsvLog:
             text = cells[self._t.place].strip()[:MAX_QUOTED_CHARACTERS]
             return Refusal("format", f"t_s = {text} s does not fit 64 bits of ns; {UNITS_ADVICE}")
         return checked_sample(t_ns, q, rate, sequence, discontinuity)
-
-
-def refuse_grouped(digits: str) -> None:
-    """Raise ValueError for numbers such as 1_0, which Python alone reads, as 10."""
-    if "_" in digits:
-        raise ValueError
 
 
 def rates_of_others(table: TextTable) -> str:

@@ -161,6 +161,12 @@ def _ratio(turned: FloatArray, by_rate: FloatArray) -> float:
     return float("nan")
 
 
+def refuse_grouped(digits: str) -> None:
+    """Raise ValueError for numbers such as 1_0, which Python alone reads, as 10."""
+    if "_" in digits:
+        raise ValueError
+
+
 def ns_of_seconds(seconds: str) -> int:
     """Decimal seconds as nanoseconds, to the nearest; a float of today's Unix time would be off by
     100 ns.
@@ -168,8 +174,7 @@ def ns_of_seconds(seconds: str) -> int:
     Raises ValueError or ArithmeticError.
     """
     value = Decimal(seconds)
-    if "_" in seconds:  # Python alone reads 1_000
-        raise ValueError
+    refuse_grouped(seconds)
     if not value.is_finite() or value.adjusted() > 40:
         raise ValueError
     return int(value.scaleb(9).to_integral_value())

@@ -363,8 +363,8 @@ def test_a_command_that_fails_is_a_failed_step_and_what_needs_it_is_not_done(tmp
         bench_text(TWIN, {"tracker": {"exposure_s": 0.045}, "render": {"tolerance_px": 0.02}})
     )
     fails = (
-        f"{shlex.quote(sys.executable)} -c \"import sys; sys.exit('camera 3 is not there')\" {{pattern}}"
-        " {output}"
+        f"{shlex.quote(sys.executable)} -c \"import sys; sys.exit('camera 3 is not there')\""
+        " {pattern} {output}"
     )
     result = go(tmp_path, "--grab", fails, "--json")
     assert result.returncode == 1

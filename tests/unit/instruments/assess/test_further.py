@@ -285,29 +285,36 @@ def slewing(count: int, taken: float) -> Any:
     return replace(found, components=components, rate_rad_s=rate_rad_s, row=np.arange(count))
 
 
-def test_rates_that_are_left_out_are_said_with_how_many(rng: np.random.Generator) -> None:
-    """Three of 400 that are 50 sigmas off, as of a field of a few stars close together."""
-    count = 400
+def figures_of_rates(t_s: FloatArray, off_rad_s: FloatArray) -> FurtherFigures:
+    """What a slewing tracker's rates of these times (n,) give, off by `off_rad_s` (n, 3)."""
+    count = len(t_s)
     run_s = np.arange(0.0, 90.0, 0.05)
     commanded = Commanded(run_s, scalar_first(attitude(motion, run_s)))
-    t_s = 2.0 + 0.2 * np.arange(count)
     moments = commanded.at(t_s)
-    reported_rad_s = moments.rate_rad_s + np.radians(0.01) * rng.standard_normal((count, 3))
-    reported_rad_s[[40, 190, 333]] += np.radians(0.5)
     found = replace(
         slewing(count, 0.0),
         clock=replace(a_clock(), t_s=t_s),
         rate_rad_s=moments.rate_rad_s,
         commanded_q=moments.q,
     )
-    valid = np.ones(count, dtype=bool)
-    t_ns = np.round(1e9 * t_s).astype(np.int64)
-    lines = np.arange(count) + 2
     telemetry = Telemetry(
-        Path("t.csv"), t_ns, moments.q, valid, lines, rate_cam_rad_s=reported_rad_s
+        Path("t.csv"),
+        np.round(1e9 * t_s).astype(np.int64),
+        moments.q,
+        np.ones(count, dtype=bool),
+        np.arange(count) + 2,
+        rate_cam_rad_s=moments.rate_rad_s + off_rad_s,
     )
     further = FurtherFigures()
     add_rates(further, telemetry, commanded, found)
+    return further
+
+
+def test_rates_that_are_left_out_are_said_with_how_many(rng: np.random.Generator) -> None:
+    """Three of 400 that are 50 sigmas off, as of a field of a few stars close together."""
+    off_rad_s = np.radians(0.01) * rng.standard_normal((400, 3))
+    off_rad_s[[40, 190, 333]] += np.radians(0.5)
+    further = figures_of_rates(2.0 + 0.2 * np.arange(400), off_rad_s)
     noise = {row.axis: row.value for row in further.rows if row.quantity == "rate noise"}
     assert noise == pytest.approx({"cross": 0.01, "roll": 0.01}, rel=0.15)
     said = [note for note in further.notes if "3 of 400 rates left out, beyond 8 sigmas" in note]
@@ -316,26 +323,8 @@ def test_rates_that_are_left_out_are_said_with_how_many(rng: np.random.Generator
 
 def test_rates_at_the_ends_of_a_run_count_for_nothing(rng: np.random.Generator) -> None:
     """Their angular acceleration is not known: what was shown before and after is not, either."""
-    count = 400
-    run_s = np.arange(0.0, 90.0, 0.05)
-    commanded = Commanded(run_s, scalar_first(attitude(motion, run_s)))
-    t_s = np.linspace(run_s[0], run_s[-1], count)
-    moments = commanded.at(t_s)
-    reported_rad_s = moments.rate_rad_s + np.radians(0.01) * rng.standard_normal((count, 3))
-    found = replace(
-        slewing(count, 0.0),
-        clock=replace(a_clock(), t_s=t_s),
-        rate_rad_s=moments.rate_rad_s,
-        commanded_q=moments.q,
-    )
-    valid = np.ones(count, dtype=bool)
-    t_ns = np.round(1e9 * t_s).astype(np.int64)
-    lines = np.arange(count) + 2
-    telemetry = Telemetry(
-        Path("t.csv"), t_ns, moments.q, valid, lines, rate_cam_rad_s=reported_rad_s
-    )
-    further = FurtherFigures()
-    add_rates(further, telemetry, commanded, found)
+    off_rad_s = np.radians(0.01) * rng.standard_normal((400, 3))
+    further = figures_of_rates(np.linspace(0.0, 89.95, 400), off_rad_s)
     bias = {row.axis: row.value for row in further.rows if row.quantity == "rate bias"}
     assert bias == pytest.approx({"cross": 0.0, "roll": 0.0}, abs=0.005)
     lag = {row.axis: row.value for row in further.rows if row.quantity == "rate lag"}

@@ -10,6 +10,8 @@ one at a time.
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 from collections import Counter
 from functools import cache
 from pathlib import Path
@@ -98,6 +100,17 @@ def is_bare(config: pytest.Config) -> bool:
     # without pytest's cache (-p no:cacheprovider) there are no options for what failed
     has_failed_ones = getattr(option, "lf", False) or getattr(option, "failedfirst", False)
     return not (option.keyword or option.markexpr or has_failed_ones)
+
+
+def import_own_part_first(worker: int, workers: int) -> None:
+    """Import every test file of the bare command, `worker`'s share of all before the others'."""
+    paths = sorted(TESTS.rglob("test_*.py"))
+    begin = len(paths) * worker // workers
+    for path in paths[begin:] + paths[:begin]:
+        module = ".".join(path.relative_to(TESTS.parent).with_suffix("").parts)
+        # the collection tells what cannot be imported, or skips itself
+        with contextlib.suppress(Exception, pytest.skip.Exception):
+            importlib.import_module(module)
 
 
 def holds_nothing_for(config: pytest.Config, path: Path) -> bool:

@@ -11,7 +11,7 @@ import itertools
 import math
 import re
 import textwrap
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
@@ -150,10 +150,9 @@ def panels_of(
     """
     # Not pyplot: it would change the backend of a program that imports this.
     from cycler import cycler
-    from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    with rc_context({**STYLE, "axes.prop_cycle": cycler(color=SERIES)}):
+    with _own_settings({**STYLE, "axes.prop_cycle": cycler(color=SERIES)}):
         if height_inch is None:
             high = MARGIN_INCH + PANEL_INCH * rows
         else:
@@ -171,6 +170,21 @@ def panels_of(
             )
         yield list(grid.flat)
         finish(figure)
+
+
+@contextmanager
+def _own_settings(settings: Mapping[str, Any]) -> Iterator[None]:
+    """Matplotlib's defaults and these settings.
+
+    What a matplotlibrc or another library in this process sets is not taken: `figure.autolayout`,
+    which Basilisk sets, ends a figure with a colour bar in an error.
+    """
+    from matplotlib import rc_context, rcParamsDefault
+
+    # to set the backend would load one
+    defaults = {name: rcParamsDefault[name] for name in rcParamsDefault if name != "backend"}
+    with rc_context({**defaults, **settings}):
+        yield
 
 
 def finish(figure: "Figure") -> None:
@@ -415,7 +429,8 @@ def save(figure: "Figure", path: Path) -> None:
 def png(figure: "Figure") -> bytes:
     """A figure as PNG, in the light colours."""
     data = io.BytesIO()
-    figure.savefig(data, format="png", dpi=PNG_DPI)
+    with _own_settings({}):
+        figure.savefig(data, format="png", dpi=PNG_DPI)
     return data.getvalue()
 
 
@@ -423,10 +438,8 @@ def svg(figure: "Figure") -> str:
     """A figure as SVG with both sets of colours: dark ones where the reader, or the page around
     it, prefers them.
     """
-    from matplotlib import rc_context
-
     data = io.StringIO()
-    with rc_context({"svg.hashsalt": "hilstar"}):  # the same figure is the same file
+    with _own_settings({"svg.hashsalt": "hilstar"}):  # the same figure is the same file
         figure.savefig(data, format="svg", metadata={"Date": None})
     rules = ""
     for light, dark in DARK.items():

@@ -7,6 +7,7 @@ import math
 import re
 from dataclasses import dataclass
 
+import matplotlib
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -42,6 +43,22 @@ def test_a_chart_is_written_for_light_and_dark_pages(tmp_path):
     charts.save(two_lines(), tmp_path / "lines.svg")
     assert (tmp_path / "lines.svg").read_text() == text
     assert_drawn(tmp_path / "lines.png")
+
+
+def test_what_a_matplotlibrc_or_another_library_sets_changes_no_chart(tmp_path):
+    """Basilisk sets `figure.autolayout`, with which a figure that has a colour bar is an error."""
+
+    def files(name: str) -> list[bytes]:
+        with charts.chart(tmp_path / name, "A finding") as (axes,):
+            dots = axes.scatter([0.0, 1.0], [0.0, 2.0], c=[0.0, 1.0])
+            axes.figure.colorbar(dots, ax=axes, label="sigma [px]")
+        return [(tmp_path / f"{name}{ending}").read_bytes() for ending in charts.ENDINGS]
+
+    own = files("own")
+    foreign = {"figure.autolayout": True, "savefig.bbox": "tight", "font.family": "serif"}
+    with matplotlib.rc_context(foreign):
+        assert files("foreign") == own
+        assert matplotlib.rcParams["figure.autolayout"]
 
 
 @pytest.mark.parametrize("paper", [charts.PAPER, charts.DARK[charts.PAPER]])

@@ -26,8 +26,10 @@ REASONS_BY_FOLDER = {
     "screen": "need an X server",
     "browser": "need a browser",
 }
-# a fixture of tests/study, for which or for a fixture with which a test asks that runs a study
-WHOLE_STUDY, WHOLE_STUDY_REASON = "whole_study", "run a whole study"
+# fixtures of tests/study that run a study, by its command or small: a test asks for one of them, or
+# for a fixture that does
+STUDY_RUNS = frozenset({"whole_study", "small_run"})
+STUDY_REASON = "run a study, whole or small"
 CASE_INDENT = "  "
 
 
@@ -81,8 +83,8 @@ def reason_to_leave_out(item: pytest.Item) -> str | None:
     for folder in folders_of(item.path):
         if folder in REASONS_BY_FOLDER:
             return REASONS_BY_FOLDER[folder]
-    if WHOLE_STUDY in getattr(item, "fixturenames", ()):
-        return WHOLE_STUDY_REASON
+    if STUDY_RUNS.intersection(getattr(item, "fixturenames", ())):
+        return STUDY_REASON
     if is_slow(item.nodeid):
         return SLOW_REASON
     return None

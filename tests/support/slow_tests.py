@@ -4,9 +4,9 @@
 
 A function is slow when all its cases together take over MAX_CPU_S, and until they take under
 BACK_CPU_S: one machine measures twice what another does. The bare command `pytest` leaves it out,
-but for the cases that fit in KEPT_CPU_S, the longest first: the quickest may be an empty one. A
-folder's fixture is charged to the first test that asks for it. `--from` reads a run that was
-measured before; functions that it has not keep what stands there.
+but for the cases that fit in KEPT_CPU_S, the longest first: the quickest may be an empty one; and
+but for those under CASE_CPU_S: a table of refusals is long, and each of its cases is a claim.
+`--from` reads a run that was measured before; functions that it has not keep what stands there.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from tests.support.cpu_times import FOLDER
 from tests.support.selection import CASE_INDENT, REASONS_BY_FOLDER, SLOW
 
 # What lets the bare command pass in three minutes on two idle cores.
-MAX_CPU_S, BACK_CPU_S, KEPT_CPU_S = 0.8, 0.4, 0.2
+MAX_CPU_S, BACK_CPU_S, KEPT_CPU_S = 0.5, 0.25, 0.2
+CASE_CPU_S = 0.02
 # What takes less was skipped, or another test's fixture did its work: what stands there is kept.
 MIN_CPU_S = 0.05
 SLOW_TESTS = ROOT / "tests" / "slow.txt"
@@ -55,6 +56,8 @@ def kept_cases(seconds: dict[str, float]) -> frozenset[str]:
         if cpu_s <= left_s:
             kept.add(case)
             left_s -= cpu_s
+        elif cpu_s < CASE_CPU_S:
+            kept.add(case)
     return frozenset(kept)
 
 

@@ -51,6 +51,9 @@ class Awake:
         self._process.stdin.close()
         while self._word():  # one that nobody has read yet is not the end
             pass
+        # the one that was begun closes its files a moment before it can be waited for
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(MAX_WAIT_S)
         if self._process.stdout is not None:
             self._process.stdout.close()
 

@@ -66,6 +66,14 @@ def whole_study(tmp_path_factory: pytest.TempPathFactory) -> WholeStudy:
 
 
 @pytest.fixture(scope="session")
+def long_run(small_run: Callable[..., SmallRun]) -> Callable[..., SmallRun]:
+    """`small_run` of a study that takes seconds however small it is made: README's command leaves
+    out the tests that ask for it.
+    """
+    return small_run
+
+
+@pytest.fixture(scope="session")
 def small_run(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., SmallRun]:
     """Runs a study's own function, which takes a folder first, in this process; its charts are
     neither laid out nor written. What makes it small is patched by the test.

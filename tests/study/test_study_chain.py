@@ -127,7 +127,7 @@ def chain_study(tmp_path_factory, whole_study):
 
 
 @pytest.fixture(scope="module")
-def small_chain(small_run, tmp_path_factory):
+def small_chain(long_run, tmp_path_factory):
     """The study of the small bench's average field and slow turn, one round of each combination."""
     file = small_file(tmp_path_factory.mktemp("bench"))
 
@@ -151,7 +151,7 @@ def small_chain(small_run, tmp_path_factory):
         patch.setattr(run, "five_scenes", two)
         patch.setattr(run, "glass_rows", lambda *asked: in_glass.append(asked) or [])
         done = []
-        found = small_run(lambda folder: run.run(file, folder, False, done.append))
+        found = long_run(lambda folder: run.run(file, folder, False, done.append))
     assert done == [1, 2]
     # the second scene is the densest field
     ((_, scene, quick),) = in_glass

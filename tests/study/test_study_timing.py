@@ -38,12 +38,12 @@ FRAME_ARCSEC = RATE_DEG_S * PERIOD_S * 3600
 
 
 @pytest.fixture(scope="module")
-def small(small_run):
+def small(long_run):
     """The quick study, whose times are of one frame; and what it measured."""
     with pytest.MonkeyPatch.context() as patch, times_are_watched():
         patch.setattr(timing, "COST_ROUNDS", 1)
         measured = timing.measure(True)
-    return small_run(timing.report, measured), measured
+    return long_run(timing.report, measured), measured
 
 
 @pytest.fixture(scope="module")

@@ -94,8 +94,8 @@ def steps_measured():
 
 
 @pytest.fixture(scope="module")
-def tradeoff_study(small_run, steps_measured):
-    small = small_run(tradeoff.report, steps_measured)
+def tradeoff_study(long_run, steps_measured):
+    small = long_run(tradeoff.report, steps_measured)
     rows = small.rows("tradeoff")
     lines, _ = small.told
     steps = {name: {r["method"]: r for r in rows if r["step"] == name} for name in NAMES}

@@ -26,10 +26,10 @@ REASONS_BY_FOLDER = {
     "screen": "need an X server",
     "browser": "need a browser",
 }
-# fixtures of tests/study that run a study, by its command or small: a test asks for one of them, or
-# for a fixture that does
-STUDY_RUNS = frozenset({"whole_study", "small_run"})
-STUDY_REASON = "run a study, whole or small"
+# fixtures of tests/study that run a study by its command, or one that takes seconds however small it
+# is: a test asks for one of them, or for a fixture that does
+STUDY_RUNS = frozenset({"whole_study", "long_run"})
+STUDY_REASON = "run a whole study, or one that takes seconds"
 CASE_INDENT = "  "
 
 

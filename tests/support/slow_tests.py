@@ -32,8 +32,7 @@ NEVER_SLOW = frozenset(
     {
         "tests/unit/instruments/campaign/test_acceptance_verdicts.py"
         "::test_failures_of_all_levels_of_a_sweep_count_together_and_each_level_has_its_folder",
-        "tests/unit/instruments/compare/test_report.py"
-        "::test_the_table_and_the_page_have_each_star",
+        "tests/unit/instruments/compare/test_report.py::test_the_table_and_the_page_have_each_star",
         "tests/unit/test_pytest_plugin.py"
         "::test_a_golden_frame_is_written_where_it_differs_by_more_than_its_limits",
     }

@@ -30,6 +30,10 @@ CASE_CPU_S = 0.02
 # tools/planted_faults.toml that no other of its tests finds (tools/mutants.py).
 NEVER_SLOW = frozenset(
     {
+        "tests/study/test_study_models.py::test_the_note_of_spectra_counts_those_beyond_its_dashed_line",
+        "tests/study/test_study_models.py::test_the_thesis_s_tables_stand_beside_what_is_here",
+        "tests/unit/cli/test_assess_and_budget.py"
+        "::test_a_budget_is_of_a_bench_and_a_centroider_and_may_be_drawn",
         "tests/unit/instruments/campaign/test_acceptance_verdicts.py"
         "::test_failures_of_all_levels_of_a_sweep_count_together_and_each_level_has_its_folder",
         "tests/unit/instruments/compare/test_report.py::test_the_table_and_the_page_have_each_star",

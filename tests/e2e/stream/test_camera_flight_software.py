@@ -155,7 +155,9 @@ print(json.dumps(numbers))
 """
 
 
-@pytest.mark.skipif(not has_aravis(), reason="Aravis is not installed (gir1.2-aravis-0.8)")
+@pytest.mark.skipif(
+    not has_aravis(), reason="Aravis is not installed (gir1.2-aravis-0.8, python3-gi)"
+)
 @pytest.mark.parametrize("form", ["Mono12", "Mono12Packed", "Mono16"])
 def test_the_frames_of_simulate_come_through_the_camera_bit_for_bit(simulated, tmp_path, form):
     settings = CameraSettings(SIDE_PX, SIDE_PX, 12, 0.04, 20.0)

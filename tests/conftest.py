@@ -69,7 +69,7 @@ def pytest_collection(session: pytest.Session) -> None:
     part of its own: workers that went through them in step would each compile them all.
     """
     worker_input = getattr(session.config, "workerinput", None)
-    if worker_input is not None and worker_input["is_bare"]:
+    if worker_input is not None and selection.imports_every_file(session.config):
         selection.import_own_part_first(
             int(worker_input["workerid"].removeprefix("gw")), worker_input["workercount"]
         )

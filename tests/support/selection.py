@@ -104,6 +104,12 @@ def is_bare(config: pytest.Config) -> bool:
     return not (option.keyword or option.markexpr or has_failed_ones)
 
 
+def imports_every_file(config: pytest.Config) -> bool:
+    """Whether the command collects all test files."""
+    option = config.option
+    return is_bare(config) and not (option.rest or option.timing)
+
+
 def import_own_part_first(worker: int, workers: int) -> None:
     """Import every test file of the bare command, `worker`'s share of all before the others'."""
     paths = sorted(TESTS.rglob("test_*.py"))

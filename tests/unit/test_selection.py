@@ -83,6 +83,7 @@ def test_of_a_slow_function_the_longest_cases_that_fit_are_kept():
     cases = {"[a]": 0.5, "[b]": 0.15, "[c]": 0.1, "[d]": 0.04, "[e]": 0.02}
     assert KEPT_CPU_S == 0.2
     assert kept_cases(cases) == {"[b]", "[d]"}
+    assert kept_cases(cases | {"[f]": 0.019}) == {"[b]", "[d]", "[f]"}  # a quick case always
     assert kept_cases({"": 0.9}) == set()
 
 

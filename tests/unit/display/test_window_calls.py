@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -358,3 +359,14 @@ def test_glfw_s_own_library_for_x11_is_taken_unless_another_is_named(monkeypatch
     chosen = Path(os.environ["PYGLFW_LIBRARY"])
     assert chosen.is_file()
     assert chosen.parts[-3:] == ("glfw", "x11", "libglfw.so")
+
+
+def test_what_begins_the_keeper_of_the_screen_is_waited_for(tmp_path, monkeypatch):
+    """It closes its stdout, and ends a moment later."""
+    beginner = tmp_path / "beginner"
+    beginner.write_text("#!/bin/sh\nexec >&-\nsleep 0.2\n")
+    beginner.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(beginner))
+    awake = Awake()
+    awake.close()
+    assert awake._process.returncode == 0
